@@ -1,0 +1,123 @@
+"""The auxiliary loss of a soft action prior: the cross-entropy from the student's distribution to the prior's."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch import distributions as d
+from torchrl.modules.distributions.utils import has_analytic_entropy, has_analytic_kl, rsample_and_log_prob
+
+from torchrl_priors.functional import categorical_cross_entropy, gaussian_cross_entropy
+
+__all__ = ["cross_entropy", "has_analytic_cross_entropy"]
+
+_CATEGORICAL = (d.Categorical, d.OneHotCategorical)
+
+
+def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None) -> Tensor:
+    r"""Cross-entropy of a policy relative to a prior, :math:`H^X(\pi\|\pi_0) = -\mathbb E_{a\sim\pi}\log\pi_0(a)`.
+
+    It is the auxiliary loss of E2R and AE2R (Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer"), and
+    minus the expected reward bonus of a step whose action is not known yet. It is differentiable with respect to the
+    parameters of both distributions.
+
+    * Closed form between categorical families (torch's and TorchRL's, indices or one-hot, masked or not), between
+      diagonal Gaussians, and for every pair with a registered :math:`\mathrm{KL}(\pi\|\pi_0)` and an analytic entropy,
+      since :math:`H^X = \mathrm{KL} + H(\pi)`. ``num_samples`` is not used then.
+    * Monte-Carlo over reparameterised samples elsewhere (e.g. :class:`~torchrl.modules.TanhNormal`). Where the KL is
+      known and only the entropy is not, only the entropy is sampled: the gradient that pulls towards the prior is then
+      exact, and no sample near the bounds of a squashed action needs to be inverted.
+    * A discrete distribution is never sampled, for the gradient would be lost: it has a closed form or it raises.
+
+    Args:
+        dist (torch.distributions.Distribution): the student's distribution, of batch shape ``[*B]``.
+        prior_dist (torch.distributions.Distribution): the prior's distribution over the same actions, of a batch shape
+            that broadcasts with ``[*B]``.
+
+    Keyword Args:
+        num_samples (int, optional): number of samples where there is no closed form. Defaults to ``None``: 1.
+
+    Returns:
+        Tensor: nats, ``[*B]``.
+
+    Raises:
+        ValueError: the two distributions are over actions of different shapes, or ``num_samples`` < 1.
+        NotImplementedError: there is no closed form, and the student can't be sampled with a gradient.
+
+    Examples:
+        >>> import torch
+        >>> from torch.distributions import Categorical
+        >>> student = Categorical(probs=torch.tensor([0.5, 0.5]))
+        >>> teacher = Categorical(probs=torch.tensor([0.25, 0.75]))
+        >>> round(cross_entropy(student, teacher).item(), 4)  # -(log 1/4 + log 3/4) / 2
+        0.837
+    """
+    if num_samples is not None and num_samples < 1:
+        raise ValueError(f"num_samples must be at least 1, got {num_samples}.")
+    _check_same_actions(dist, prior_dist)
+    closed_form = _closed_form(dist, prior_dist)
+    if closed_form is not None:
+        return closed_form
+    if not dist.has_rsample:
+        raise NotImplementedError(
+            f"The cross-entropy of {type(dist).__name__} relative to {type(prior_dist).__name__} has no closed form, and"
+            f" {type(dist).__name__} has no reparameterised samples to estimate it from: give both networks"
+            " distributions of one family (categorical, Gaussian, ...)."
+        )
+    shape = torch.Size([1 if num_samples is None else num_samples])
+    action, log_prob = rsample_and_log_prob(dist, shape)
+    if has_analytic_kl(dist, prior_dist):
+        return d.kl_divergence(dist, prior_dist) - log_prob.mean(0)
+    return -prior_dist.log_prob(action).mean(0)
+
+
+def has_analytic_cross_entropy(dist: d.Distribution, prior_dist: d.Distribution) -> bool:
+    """Whether :func:`cross_entropy` of the pair is exact rather than estimated from samples.
+
+    Examples:
+        >>> import torch
+        >>> from torch.distributions import Categorical
+        >>> has_analytic_cross_entropy(Categorical(torch.ones(2)), Categorical(torch.ones(2)))
+        True
+    """
+    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
+        return True
+    return has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist)
+
+
+def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | None:
+    """The exact cross-entropy of the pair, or ``None``."""
+    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
+        log_probs, prior_log_probs = dist.logits, prior_dist.logits
+        # an action that the student can't take costs nothing, even where the prior forbids it too: 0 log 0 = 0
+        return categorical_cross_entropy(log_probs, prior_log_probs.masked_fill(log_probs.isneginf(), 0.0))
+    if isinstance(dist, d.Independent) and isinstance(prior_dist, d.Independent):
+        ndims = dist.reinterpreted_batch_ndims
+        if ndims == prior_dist.reinterpreted_batch_ndims:
+            base, prior_base = dist.base_dist, prior_dist.base_dist
+            if ndims == 1 and isinstance(base, d.Normal) and isinstance(prior_base, d.Normal):
+                return gaussian_cross_entropy(base.loc, base.scale, prior_base.loc, prior_base.scale)
+            terms = _closed_form(base, prior_base)
+            return terms if terms is None or ndims == 0 else terms.flatten(-ndims).sum(-1)
+    if isinstance(dist, d.Normal) and isinstance(prior_dist, d.Normal):
+        return gaussian_cross_entropy(
+            dist.loc.unsqueeze(-1),
+            dist.scale.unsqueeze(-1),
+            prior_dist.loc.unsqueeze(-1),
+            prior_dist.scale.unsqueeze(-1),
+        )
+    if has_analytic_cross_entropy(dist, prior_dist):
+        return d.kl_divergence(dist, prior_dist) + dist.entropy()
+    return None
+
+
+def _check_same_actions(dist: d.Distribution, prior_dist: d.Distribution) -> None:
+    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
+        shape, prior_shape = dist.logits.shape[-1:], prior_dist.logits.shape[-1:]
+    else:
+        shape, prior_shape = dist.event_shape, prior_dist.event_shape
+    if shape != prior_shape:
+        raise ValueError(
+            f"The student and the prior must be distributions over the same actions, got {type(dist).__name__} over"
+            f" {tuple(shape)} and {type(prior_dist).__name__} over {tuple(prior_shape)}."
+        )
