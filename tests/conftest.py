@@ -1,4 +1,4 @@
-"""What every test starts from: one thread, a fixed seed, the CPU."""
+"""What every test starts from: one thread and a fixed seed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ settings.load_profile("deterministic")
 @pytest.fixture(autouse=True)
 def _seeded() -> Iterator[None]:
     """Seed torch's global generator, and leave it as it was found."""
-    with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         yield
 
