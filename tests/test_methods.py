@@ -1,0 +1,60 @@
+"""The presets against the table of methods."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError, replace
+
+import pytest
+
+from torchrl_priors.methods import METHODS, MethodSpec, get_method
+
+
+@pytest.mark.parametrize(
+    ("name", "bonus", "auxiliary", "adaptive", "weight_target"),
+    [
+        ("none", "none", False, False, "td"),
+        ("er", "current", False, False, "td"),
+        ("e2r", "next", True, False, "td"),
+        ("aer", "current", False, True, "td"),
+        ("ae2r", "next", True, True, "td"),
+        ("kickstart", "none", True, False, "td"),
+        ("aligned", "none", True, True, "advantage"),
+    ],
+)
+def test_a_method_is_its_row_of_the_table(
+    name: str, bonus: str, auxiliary: bool, adaptive: bool, weight_target: str
+) -> None:
+    spec = get_method(name)
+    assert (spec.bonus, spec.auxiliary, spec.adaptive, spec.weight_target) == (
+        bonus,
+        auxiliary,
+        adaptive,
+        weight_target,
+    )
+
+
+def test_there_is_no_method_outside_the_table() -> None:
+    assert set(METHODS) == {"none", "er", "e2r", "aer", "ae2r", "kickstart", "aligned"}
+
+
+@pytest.mark.parametrize(("fixed", "adaptive"), [("er", "aer"), ("e2r", "ae2r")])
+def test_the_adaptive_methods_differ_by_the_weight_alone(fixed: str, adaptive: str) -> None:
+    assert replace(get_method(fixed), adaptive=True) == get_method(adaptive)
+
+
+def test_aligned_is_kickstart_with_a_weight_learned_from_the_advantage() -> None:
+    assert replace(get_method("kickstart"), adaptive=True, weight_target="advantage") == get_method("aligned")
+
+
+@pytest.mark.parametrize("name", ["AE2R", "", "ppo"])
+def test_an_unknown_method_is_an_error_that_lists_the_known_ones(name: str) -> None:
+    with pytest.raises(ValueError, match="Unknown method") as error:
+        get_method(name)
+    assert repr(name) in str(error.value)
+    assert all(known in str(error.value) for known in METHODS)
+
+
+def test_a_preset_cannot_be_changed_in_place() -> None:
+    with pytest.raises(FrozenInstanceError):
+        get_method("er").adaptive = True  # type: ignore[misc]
+    assert isinstance(get_method("er"), MethodSpec)
