@@ -2,6 +2,17 @@
 
 from __future__ import annotations
 
-from .cross_entropy import cross_entropy, has_analytic_cross_entropy
+from .ae2r import AE2RLoss
+from .avec import AVECMixin, ValueOffset
+from .cross_entropy import cross_entropy, has_analytic_cross_entropy, kl_divergence
+from .ppo import ClipPPOPriorLoss
 
-__all__ = ["cross_entropy", "has_analytic_cross_entropy"]
+__all__ = [
+    "AE2RLoss",
+    "AVECMixin",
+    "ClipPPOPriorLoss",
+    "ValueOffset",
+    "cross_entropy",
+    "has_analytic_cross_entropy",
+    "kl_divergence",
+]

@@ -9,7 +9,7 @@ from torchrl.modules.distributions.utils import has_analytic_entropy, has_analyt
 
 from torchrl_priors.functional import categorical_cross_entropy, gaussian_cross_entropy
 
-__all__ = ["cross_entropy", "has_analytic_cross_entropy"]
+__all__ = ["cross_entropy", "has_analytic_cross_entropy", "kl_divergence"]
 
 _CATEGORICAL = (d.Categorical, d.OneHotCategorical)
 
@@ -60,8 +60,8 @@ def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
         return closed_form
     if not dist.has_rsample:
         raise NotImplementedError(
-            f"The cross-entropy of {type(dist).__name__} relative to {type(prior_dist).__name__} has no closed form, and"
-            f" {type(dist).__name__} has no reparameterised samples to estimate it from: give both networks"
+            f"The cross-entropy of {type(dist).__name__} relative to {type(prior_dist).__name__} has no closed form,"
+            f" and {type(dist).__name__} has no reparameterised samples to estimate it from: give both networks"
             " distributions of one family (categorical, Gaussian, ...)."
         )
     shape = torch.Size([1 if num_samples is None else num_samples])
@@ -83,6 +83,27 @@ def has_analytic_cross_entropy(dist: d.Distribution, prior_dist: d.Distribution)
     if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
         return True
     return has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist)
+
+
+def kl_divergence(dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None) -> Tensor:
+    r"""Divergence of a policy from a prior, :math:`\mathrm{KL}(\pi\|\pi_0) = H^X(\pi\|\pi_0) - H(\pi)`, nats, ``[*B]``.
+
+    Takes and raises what :func:`cross_entropy` does. It is meant for logging: unlike the cross-entropy, it is 0 where
+    the student is the prior, whatever the prior's entropy.
+
+    Examples:
+        >>> import torch
+        >>> from torch.distributions import Categorical
+        >>> kl_divergence(Categorical(torch.ones(2)), Categorical(torch.ones(2))).item()
+        0.0
+    """
+    if has_analytic_cross_entropy(dist, prior_dist) and has_analytic_entropy(dist):
+        return cross_entropy(dist, prior_dist) - dist.entropy()
+    if has_analytic_kl(dist, prior_dist):
+        return d.kl_divergence(dist, prior_dist)
+    shape = torch.Size([1 if num_samples is None else num_samples])
+    action, log_prob = rsample_and_log_prob(dist, shape)
+    return (log_prob - prior_dist.log_prob(action)).mean(0)
 
 
 def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | None:
