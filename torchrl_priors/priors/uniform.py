@@ -1,0 +1,117 @@
+"""All actions are equally probable: a prior for controls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torch import distributions as d
+from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.modules import OneHotCategorical
+
+from torchrl_priors.priors.action_prior import ActionPrior
+
+__all__ = ["UniformPrior"]
+
+
+class UniformPrior(ActionPrior):
+    r"""The prior that knows nothing: all actions are equally probable.
+
+    Over discrete actions, rewarding its (constant) log-probability changes nothing, and the cross-entropy to it is
+    constant: useful as a control, and as the adversary of a degradation.
+
+    Args:
+        actions (TensorSpec or int): the action spec (without batch dimensions of an environment): discrete
+            (:class:`~torchrl.data.Categorical`, :class:`~torchrl.data.OneHot`) or :class:`~torchrl.data.Bounded` and
+            continuous; or a number of discrete actions, given by their indices.
+
+    Keyword Args:
+        namespace (str or tuple of str): as in :class:`ActionPrior`.
+
+    Raises:
+        ValueError: a number of actions below 1, or a spec without a uniform distribution (unbounded).
+        TypeError: a spec of another kind.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> batch = TensorDict(action=torch.zeros(5, 2), batch_size=[5])
+        >>> UniformPrior(Bounded(-1.0, 1.0, shape=(2,))).log_prob(batch)[0]  # -2 log 2
+        tensor(-1.3863)
+        >>> UniformPrior(4).get_dist(batch).probs[0]
+        tensor([0.2500, 0.2500, 0.2500, 0.2500])
+    """
+
+    def __init__(self, actions: TensorSpec | int, *, namespace: NestedKey = "prior") -> None:
+        params, distribution_class, kwargs = _uniform(actions)
+        names = list(params)
+        super().__init__(
+            ProbabilisticTensorDictSequential(
+                _Constant(params),
+                ProbabilisticTensorDictModule(
+                    in_keys=names,
+                    out_keys=["action"],
+                    distribution_class=distribution_class,
+                    distribution_kwargs=kwargs,
+                ),
+            ),
+            namespace=namespace,
+        )
+
+    def adversary(self) -> ActionPrior:
+        """The prior itself: no advice has no opposite."""
+        return self
+
+
+class _Constant(TensorDictModuleBase):
+    """Writes the same values at every step."""
+
+    def __init__(self, values: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = []
+        self.out_keys = list(values)
+        for name, value in values.items():
+            self.register_buffer(name, value)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for name in self.out_keys:
+            value = getattr(self, name)
+            tensordict.set(name, value.to(tensordict.device).expand(*tensordict.batch_size, *value.shape))
+        return tensordict
+
+
+class _BoxUniform(d.Independent):
+    """Uniform over a closed box, so that an action clipped to a bound has a finite log-probability."""
+
+    def __init__(self, low: Tensor, high: Tensor, event_dims: int) -> None:
+        super().__init__(d.Uniform(low, high, validate_args=False), event_dims)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        low, high = self.base_dist.low, self.base_dist.high
+        density = torch.where((low <= value) & (value <= high), -(high - low).log(), -torch.inf)
+        dims = self.reinterpreted_batch_ndims
+        return density.flatten(-dims).sum(-1) if dims else density
+
+
+def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[str, Any]]:
+    """Parameters (by name), class and further arguments of a uniform distribution over ``actions``."""
+    if isinstance(actions, int):
+        if actions < 1:
+            raise ValueError(f"A uniform prior needs at least one action, got {actions}.")
+        return {"logits": torch.zeros(actions)}, d.Categorical, {}
+    if isinstance(actions, OneHot):
+        return {"logits": torch.zeros(actions.shape[-1], device=actions.device)}, OneHotCategorical, {}
+    if isinstance(actions, Categorical):
+        return {"logits": torch.zeros(actions.n, device=actions.device)}, d.Categorical, {}
+    if isinstance(actions, Bounded) and actions.dtype.is_floating_point:
+        low, high = actions.space.low, actions.space.high
+        if not (low.isfinite().all() and high.isfinite().all()):
+            raise ValueError(f"There is no uniform distribution over unbounded actions: {actions}.")
+        return {"low": low.clone(), "high": high.clone()}, _BoxUniform, {"event_dims": low.ndim}
+    raise TypeError(
+        f"Expected a number of actions or a spec of kind Categorical, OneHot or (continuous) Bounded, got {actions}."
+    )
