@@ -63,14 +63,15 @@ class StateTable(TensorDictModuleBase):
         self.in_keys = [in_key]
         self.out_keys = [out_key]
         self.batch_dims = table.ndim - feature_dims - 1
-        if isinstance(table, nn.Parameter):
+        self.learned = isinstance(table, nn.Parameter)
+        if self.learned:
             self.table = table
         else:
             self.register_buffer("table", table.detach().clone())
 
     def reset_parameters(self) -> None:
         """Sets a learned table to 0."""
-        if isinstance(self.table, nn.Parameter):
+        if self.learned:
             nn.init.zeros_(self.table)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -66,18 +66,18 @@ class ActionPrior(TensorDictModuleBase):
 
     def __init__(self, module: TensorDictModuleBase, *, namespace: NestedKey = "prior") -> None:
         super().__init__()
-        self._names: list[str]
+        self.param_names: list[str]
         if isinstance(module, ActionPrior):
-            self._names = module._names
+            self.param_names = module.param_names
         else:
             last = _distribution_module(module)
-            self._names = [key[-1] if isinstance(key, tuple) else key for key in last.dist_keys]
+            self.param_names = [key[-1] if isinstance(key, tuple) else key for key in last.dist_keys]
             module = deepcopy(module)
         self.module = module.requires_grad_(False)
         self.namespace = unravel_key(namespace)
         self.action_key: NestedKey = module.action_key if isinstance(module, ActionPrior) else "action"
         self.in_keys = list(module.in_keys)
-        self.out_keys = [self._key(name) for name in self._names]
+        self.out_keys = [self._key(name) for name in self.param_names]
         self.train(False)
 
     def _key(self, name: str) -> NestedKey:
@@ -116,14 +116,16 @@ class ActionPrior(TensorDictModuleBase):
         private = _select(tensordict, module.in_keys)
         if isinstance(module, ProbabilisticTensorDictSequential):
             private = module.get_dist_params(private)
-        return dict(zip(self._names, (private.get(key) for key in _distribution_module(module).in_keys), strict=True))
+        return dict(
+            zip(self.param_names, (private.get(key) for key in _distribution_module(module).in_keys), strict=True)
+        )
 
     def build_dist(self, params: dict[str, Tensor]) -> d.Distribution:
         """The distribution with the parameters of :meth:`get_params`."""
         if isinstance(self.module, ActionPrior):
             return self.module.build_dist(params)
         last = _distribution_module(self.module)
-        values = TensorDict(dict(zip(last.in_keys, (params[name] for name in self._names), strict=True)))
+        values = TensorDict(dict(zip(last.in_keys, (params[name] for name in self.param_names), strict=True)))
         return last.get_dist(values)
 
     def get_dist(self, tensordict: TensorDictBase) -> d.Distribution:
@@ -176,7 +178,7 @@ class ActionPrior(TensorDictModuleBase):
         Raises:
             NotImplementedError: the distribution has no parameter that could be negated.
         """
-        return _Adversary(self)
+        return NegatedPrior(self)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -186,21 +188,28 @@ class ActionPrior(TensorDictModuleBase):
         return tensordict
 
 
-class _Adversary(ActionPrior):
+class NegatedPrior(ActionPrior):
     """The negated advice of a prior; see :meth:`ActionPrior.adversary`."""
 
     def __init__(self, prior: ActionPrior) -> None:
         super().__init__(prior, namespace=prior.namespace)
-        if not _NEGATED & set(self._names):
+        if not _NEGATED & set(self.param_names):
             raise NotImplementedError(
-                f"A distribution with parameters {', '.join(self._names)} has no adversary: expected one of"
+                f"A distribution with parameters {', '.join(self.param_names)} has no adversary: expected one of"
                 f" {', '.join(sorted(_NEGATED))}. Pass an adversary of your own where one is needed."
             )
 
     def get_params(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
-        return {name: _negate(name, value) for name, value in super().get_params(tensordict).items()}
+        """The negated parameters of the distribution by name."""
+        return self.negate(super().get_params(tensordict))
+
+    @staticmethod
+    def negate(params: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Negates what says where the distribution points to, and keeps the rest, e.g. the ``scale``."""
+        return {name: _negate(name, value) for name, value in params.items()}
 
     def adversary(self) -> ActionPrior:
+        """The prior whose advice is negated here."""
         return self.module
 
 
@@ -213,7 +222,8 @@ def _negate(name: str, value: Tensor) -> Tensor:
     if name == "logits":
         return torch.where(value.isneginf(), value, -value)  # what can't be done can't be done
     if name == "probs":
-        return torch.where(value == 0, value, value.log().neg()).masked_fill(value == 0, -torch.inf).softmax(-1)
+        inverse = torch.where(value == 0, 0, 1 / value)
+        return inverse / inverse.sum(-1, keepdim=True)
     return value
 
 
