@@ -1,0 +1,22 @@
+"""Figures in the form of the paper's (Centa & Preux), from plain arrays.
+
+Every function returns a :class:`matplotlib.figure.Figure` and leaves no trace in pyplot or matplotlib's settings, so
+that it works in a job without a display, in a notebook and in threads alike. Needs matplotlib
+(``pip install torchrl-priors[recipes]``).
+"""
+
+from torchrl_priors.plots.curves import learning_curves, performance_profiles
+from torchrl_priors.plots.grid import grid_world
+from torchrl_priors.plots.intervals import iqm_bars
+from torchrl_priors.plots.style import method_color, method_label, prior_label, save_figure
+
+__all__ = [
+    "grid_world",
+    "iqm_bars",
+    "learning_curves",
+    "method_color",
+    "method_label",
+    "performance_profiles",
+    "prior_label",
+    "save_figure",
+]
