@@ -1,8 +1,8 @@
 """Figures in the form of the paper's (Centa & Preux), from plain arrays.
 
 Every function returns a :class:`matplotlib.figure.Figure` and leaves no trace in pyplot or matplotlib's settings, so
-that it works in a job without a display, in a notebook and in threads alike. Needs matplotlib
-(``pip install torchrl-priors[recipes]``).
+that it works in a job without a display and in a notebook alike (but one figure at a time: matplotlib's settings are
+shared by all threads while a figure is made). Needs matplotlib (``pip install torchrl-priors[recipes]``).
 """
 
 from torchrl_priors.plots.curves import learning_curves, performance_profiles
