@@ -55,6 +55,11 @@ class Degradation(ActionPrior):
         """What the prior drew at random and left in the batch, its adversary's draws included."""
         return list(dict.fromkeys([*super().draw_keys, *self.bad_advice.draw_keys]))
 
+    def draw(self, tensordict: TensorDictBase) -> None:
+        """Draws what the prior and its adversary draw at random, unless it is there already."""
+        super().draw(tensordict)
+        self.bad_advice.draw(tensordict)
+
     @torch.no_grad()
     def get_params(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The parameters of the distribution by name: the adversary's where the mask is true."""
@@ -209,6 +214,11 @@ class RandomDegradation(Degradation):
     def draw_keys(self) -> list[NestedKey]:
         """What the prior drew at random and left in the batch: its own draw last."""
         return [*super().draw_keys, self.draw_key]
+
+    def draw(self, tensordict: TensorDictBase) -> None:
+        """Draws whose advice each step sees, unless it is there already."""
+        super().draw(tensordict)
+        self.mask(tensordict)
 
     def mask(self, tensordict: TensorDictBase) -> Tensor:
         """The draw of each step, bool ``[*B, 1]``: the tensordict's, or a new one that is written into it."""

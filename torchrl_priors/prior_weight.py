@@ -16,8 +16,8 @@ class PriorWeight(TensorDictModuleBase):
     r"""A learned weight of the prior's advice, :math:`\omega_\psi(s) = \mathrm{sigmoid}(f_\psi(s)) \in [0, 1]`.
 
     Of AER and AE2R in Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer". It multiplies the reward
-    bonus and the auxiliary loss, so that bad advice is switched off where it is bad. With the last layer scaled down, it
-    starts near ``sigmoid(init_bias)`` in every state: one half by default.
+    bonus and the auxiliary loss, so that bad advice is switched off where it is bad. With the last layer scaled down,
+    it starts near ``sigmoid(init_bias)`` in every state: one half by default.
 
     Args:
         net (nn.Module or TensorDictModule): :math:`f_\psi`, from the entries ``in_keys`` to a logit ``[*B, 1]``,

@@ -136,11 +136,19 @@ class ActionPrior(TensorDictModuleBase):
         """
         return self.build_dist(self.get_params(tensordict))
 
-    def log_prob(self, tensordict: TensorDictBase) -> Tensor:
+    def draw(self, tensordict: TensorDictBase) -> None:
+        """Draws what the prior draws at random into :attr:`draw_keys`, unless it is there already."""
+        if isinstance(self.module, ActionPrior):
+            self.module.draw(tensordict)
+
+    def log_prob(self, tensordict: TensorDictBase, *, dist: d.Distribution | None = None) -> Tensor:
         r"""Log-probability of the action that was taken, :math:`\log\pi_0(a_t|s_t)`.
 
         Args:
             tensordict (TensorDictBase): holds :attr:`in_keys` and the action, batch ``[*B]``.
+
+        Keyword Args:
+            dist (torch.distributions.Distribution, optional): from :meth:`get_dist`, to save its computation.
 
         Returns:
             Tensor: nats, ``[*B]``: the joint log-probability where the action has several independent dimensions.
@@ -154,7 +162,7 @@ class ActionPrior(TensorDictModuleBase):
             raise KeyError(
                 f"The prior scores actions under {self.action_key!r}, which is missing: set_keys(action=...)."
             )
-        dist = self.get_dist(tensordict)
+        dist = self.get_dist(tensordict) if dist is None else dist
         expected = _action_shape(dist)
         if action.shape != expected:
             raise ValueError(

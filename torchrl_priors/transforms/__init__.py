@@ -1,0 +1,6 @@
+"""Transforms of batches of trajectories: the prior's log-probabilities, and the reward bonus that is made of them."""
+
+from torchrl_priors.transforms.prior_bonus import PriorBonus
+from torchrl_priors.transforms.prior_log_prob import PriorLogProb
+
+__all__ = ["PriorBonus", "PriorLogProb"]

@@ -1,0 +1,47 @@
+"""Transforms that look at whole trajectories, and can therefore not run inside of an environment."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torchrl.envs import EnvBase, Transform
+
+__all__ = ["BatchTransform", "under_next"]
+
+
+def under_next(key: NestedKey) -> NestedKey:
+    """The key of the same entry of the next step."""
+    return unravel_key(("next", key))
+
+
+class BatchTransform(Transform):
+    """Base of transforms that read and write batches of trajectories ``[*B, T]``, outside of environments.
+
+    Their ``forward`` does the work: as a plain call on a batch, as the ``postproc`` of a collector, and in a replay
+    buffer when it is sampled (``rb.append_transform(transform)``) or written (``rb.append_transform(transform,
+    invert=True)``), alone or in a :class:`~torchrl.envs.Compose`.
+    """
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Refuses an environment, at whatever depth."""
+        if isinstance(container, EnvBase) or container.parent is not None:
+            self._refuse()
+        super().set_container(container)
+
+    def _refuse(self) -> NoReturn:
+        raise ValueError(
+            f"{type(self).__name__} reads whole trajectories, which an environment does not see: use it as the"
+            " postproc of a collector, in a replay buffer, or call it on a batch."
+        )
+
+    def _call(self, next_tensordict: TensorDictBase) -> NoReturn:
+        self._refuse()
+
+    def _get(self, tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            raise KeyError(f"{type(self).__name__} reads {key!r}, which is not in the batch. {hint}".rstrip())
+        return value

@@ -1,0 +1,224 @@
+"""Log-probabilities of what the student did under a prior, and their one-step shift."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torch import distributions as d
+
+from torchrl_priors.functional import has_next_action, shift_to_next
+from torchrl_priors.objectives.cross_entropy import cross_entropy
+from torchrl_priors.priors import ActionPrior
+from torchrl_priors.transforms.batch_transform import BatchTransform, under_next
+
+__all__ = ["PriorLogProb"]
+
+_Boundary = Literal["expected", "sample", "zero"]
+_Centering = Literal["none", "prior", "policy"]
+
+
+class PriorLogProb(BatchTransform):
+    r"""Writes :math:`\log\pi_0(a_t|s_t)`, and :math:`\log\pi_0(a_{t+1}|s_{t+1})` under ``"next"``.
+
+    The first stage of reward shaping by a soft action prior (Centa & Preux, "Soft Action Priors: Towards Robust Policy
+    Transfer"): ER rewards the first entry, E2R the second. It runs once a batch, without gradient. The entry of the
+    next step is
+
+    1. 0 where the episode terminated at t;
+    2. that of step t + 1 where there is one: not after a step that is done, nor where trajectory ids differ (the seams
+       between workers of a collector, whose ``done`` is false), nor at the end of the batch;
+    3. elsewhere, where no next action was sampled, what ``boundary`` says of the next state.
+
+    Args:
+        prior (ActionPrior): the prior; it also says where the action is (:meth:`ActionPrior.set_keys`). What it draws
+            at random is left in the batch, for the step and for the next one.
+        actor (ProbabilisticTensorDictSequential, optional): the student :math:`\pi`, for ``boundary`` and
+            ``centering``. It is used as it is when a batch arrives, and is no submodule of the transform: moving or
+            saving the transform leaves it alone.
+
+    Keyword Args:
+        time_dim (int, optional): the batch dimension along which time runs. Defaults to ``None``: the one named
+            ``"time"``, as in what collectors and rollouts return.
+        boundary ("expected", "sample" or "zero"): ``"expected"`` (default) is :math:`-H^X_{s'}(\pi\|\pi_0)`, the mean
+            over the student's next action, in closed form where there is one; ``"sample"`` is the log-probability of an
+            action drawn from the student; ``"zero"`` is no advice.
+        centering ("none", "prior" or "policy"): what else is written, to centre the bonus: :math:`H(\pi_0)`, or
+            :math:`H^X(\pi\|\pi_0)`, of each state and of the next one, by the same rules. Defaults to ``"none"``.
+        num_samples (int, optional): for a cross-entropy without a closed form. Defaults to ``None``: 1.
+        out_keys (list of NestedKey, optional): defaults to ``["prior_log_prob"]``, with centring
+            ``["prior_log_prob", "prior_center"]``; each is written ``[*B, T, 1]`` in nats, and under ``"next"`` too.
+        done_key, terminated_key (NestedKey): bool, ``[*B, T, 1]``, read under ``"next"``. Defaults to ``"done"`` and
+            ``"terminated"``.
+        traj_key (NestedKey): trajectory ids ``[*B, T]``, used if they are there. Defaults to
+            ``("collector", "traj_ids")``.
+        mask_key (NestedKey): bool ``[*B, T]``, false at the padding of split trajectories, used if it is there.
+            Defaults to ``("collector", "mask")``.
+
+    Raises:
+        ValueError: ``boundary`` or ``centering`` needs an actor; the batch has no time dimension; the prior is over
+            other actions; the transform is put into an environment.
+        KeyError: an entry is missing in the batch.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_priors.priors import BoltzmannPrior
+        >>> prior = BoltzmannPrior(torch.tensor([[0.0, 1.0], [2.0, 0.0]]))
+        >>> batch = TensorDict(
+        ...     state=torch.tensor([0, 1, 0]),
+        ...     action=torch.tensor([1, 0, 1]),
+        ...     next=TensorDict(
+        ...         state=torch.tensor([1, 0, 1]),
+        ...         done=torch.tensor([[False], [True], [False]]),
+        ...         terminated=torch.tensor([[False], [True], [False]]),
+        ...     ),
+        ...     batch_size=[3],
+        ...     names=["time"],
+        ... )
+        >>> batch = PriorLogProb(prior, boundary="zero")(batch)
+        >>> batch["prior_log_prob"].squeeze(-1)
+        tensor([-0.3133, -0.1269, -0.3133])
+        >>> batch["next", "prior_log_prob"].squeeze(-1)  # of the second step, terminated, the end of the batch
+        tensor([-0.1269,  0.0000,  0.0000])
+    """
+
+    def __init__(
+        self,
+        prior: ActionPrior,
+        actor: TensorDictModuleBase | None = None,
+        *,
+        time_dim: int | None = None,
+        boundary: _Boundary = "expected",
+        centering: _Centering = "none",
+        num_samples: int | None = None,
+        out_keys: list[NestedKey] | None = None,
+        done_key: NestedKey = "done",
+        terminated_key: NestedKey = "terminated",
+        traj_key: NestedKey = ("collector", "traj_ids"),
+        mask_key: NestedKey = ("collector", "mask"),
+    ) -> None:
+        for name, value, known in (("boundary", boundary, _Boundary), ("centering", centering, _Centering)):
+            if value not in get_args(known):
+                raise ValueError(f"Unknown {name} {value!r}: expected one of {', '.join(get_args(known))}.")
+        if actor is None and (boundary != "zero" or centering == "policy"):
+            raise ValueError(
+                f"boundary={boundary!r} with centering={centering!r} needs the student: pass actor, or boundary='zero'"
+                " and no centering by the policy."
+            )
+        if out_keys is None:
+            out_keys = ["prior_log_prob"] if centering == "none" else ["prior_log_prob", "prior_center"]
+        if len(out_keys) != (1 if centering == "none" else 2):
+            raise ValueError(f"Expected one key for the log-probability and one for a center, got {out_keys}.")
+        super().__init__(in_keys=[*prior.in_keys, prior.action_key], out_keys=out_keys)
+        self.prior = prior
+        self.__dict__["actor"] = actor
+        self.time_dim = time_dim
+        self.boundary = boundary
+        self.centering = centering
+        self.num_samples = num_samples
+        self.done_key = under_next(done_key)
+        self.terminated_key = under_next(terminated_key)
+        self.traj_key = unravel_key(traj_key)
+        self.mask_key = unravel_key(mask_key)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the entries into a batch ``[*B, T]`` and returns it."""
+        time_dim = self._find_time_dim(tensordict)
+        terminated, has_next, wanted = self._boundaries(tensordict, time_dim)
+        self._draw(tensordict, has_next, time_dim)
+
+        dist = self.prior.get_dist(tensordict)
+        values = [self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)]
+        if self.centering != "none":
+            policy = self._student(tensordict) if self.centering == "policy" else None
+            values.append(self._center(dist, policy, tensordict.ndim))
+
+        at_boundary = [torch.zeros_like(value) for value in values]
+        # only the time steps at which some trajectory was cut
+        steps = wanted.movedim(time_dim, 0).flatten(1).any(-1).nonzero().squeeze(-1)
+        if self.boundary != "zero" and len(steps):
+            following = tensordict.get("next")[(slice(None),) * time_dim + (steps,)]
+            for full, part in zip(at_boundary, self._evaluate_boundary(following), strict=True):
+                full.index_copy_(time_dim, steps, part.to(full.dtype))
+
+        for key, value, boundary_value in zip(self.out_keys, values, at_boundary, strict=True):
+            tensordict.set(key, value)
+            shifted = shift_to_next(value, boundary_value, has_next, terminated, time_dim=time_dim)
+            tensordict.set(under_next(key), shifted)
+        return tensordict
+
+    def _find_time_dim(self, tensordict: TensorDictBase) -> int:
+        """The time dimension, given or named: one that is guessed wrong would shift over the batch."""
+        shape = tuple(tensordict.batch_size)
+        if self.time_dim is not None:
+            if not -len(shape) <= self.time_dim < len(shape):
+                raise ValueError(f"time_dim={self.time_dim} is not a dimension of the batch {shape}.")
+            return self.time_dim % len(shape)
+        names = list(tensordict.names)
+        if "time" not in names:
+            raise ValueError(
+                f"The batch {shape} has no dimension named 'time' (its names are {names}): pass time_dim=..., or name"
+                " it, e.g. batch.names = [None, 'time']."
+            )
+        return names.index("time")
+
+    def _boundaries(self, tensordict: TensorDictBase, time_dim: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Where an episode terminates, where a step has a next action, and where the boundary's value is wanted."""
+        terminated, done = self._get(tensordict, self.terminated_key), self._get(tensordict, self.done_key)
+        expected = (*tensordict.batch_size, 1)
+        for key, flag in ((self.terminated_key, terminated), (self.done_key, done)):
+            if flag.shape != expected:
+                raise ValueError(f"Expected {key!r} of shape {tuple(expected)}, got {tuple(flag.shape)}.")
+        traj_ids, mask = (tensordict.get(key, None) for key in (self.traj_key, self.mask_key))
+        has_next = has_next_action(done, None if traj_ids is None else traj_ids.reshape(expected), time_dim=time_dim)
+        wanted = ~terminated
+        if mask is not None:
+            mask = mask.reshape(expected)
+            has_next = has_next & shift_to_next(mask, False, has_next, terminated, time_dim=time_dim)
+            wanted = wanted & mask
+        return terminated, has_next, wanted & ~has_next
+
+    def _draw(self, tensordict: TensorDictBase, has_next: Tensor, time_dim: int) -> None:
+        """Lets the prior draw, the same for the next state of step t and for the state of step t + 1."""
+        if not self.prior.draw_keys:
+            return
+        following = tensordict.get("next")
+        self.prior.draw(tensordict)
+        self.prior.draw(following)
+        for key in self.prior.draw_keys:
+            draw = shift_to_next(
+                tensordict.get(key), following.get(key), has_next, torch.zeros_like(has_next), time_dim=time_dim
+            )
+            tensordict.set(under_next(key), draw)
+
+    def _evaluate_boundary(self, following: TensorDictBase) -> list[Tensor]:
+        """The values of next states whose action was not sampled, ``[*B, steps, 1]``."""
+        prior_dist, policy = self.prior.get_dist(following), self._student(following)
+        if self.boundary == "expected":
+            log_prob = -cross_entropy(policy, prior_dist, num_samples=self.num_samples)
+        else:
+            log_prob = prior_dist.log_prob(policy.sample())
+        values = [_joint(log_prob, following.ndim)]
+        if self.centering != "none":
+            values.append(self._center(prior_dist, policy, following.ndim))
+        return values
+
+    def _student(self, tensordict: TensorDictBase) -> d.Distribution:
+        actor: TensorDictModuleBase = self.__dict__["actor"]
+        return actor.get_dist(tensordict.copy())  # an actor writes its parameters
+
+    def _center(self, prior_dist: d.Distribution, policy: d.Distribution | None, ndim: int) -> Tensor:
+        """H(pi0) or H^X(pi || pi0), ``[*B, 1]``."""
+        of = prior_dist if self.centering == "prior" or policy is None else policy
+        return _joint(cross_entropy(of, prior_dist, num_samples=self.num_samples), ndim)
+
+
+def _joint(value: Tensor, ndim: int) -> Tensor:
+    """The sum over independent actions of a step, from ``[*B]`` or ``[*B, ...]`` to ``[*B, 1]``."""
+    return value.flatten(ndim).sum(-1, keepdim=True) if value.ndim > ndim else value.unsqueeze(-1)
