@@ -36,6 +36,7 @@ class AE2RLoss(LossModule):
     :math:`\pi` the student, :math:`\pi_0` the prior and :math:`\omega(s)\in[0,1]` the prior weight,
 
     * ``"loss_prior"``, :math:`c_{aux}\,\mathrm{sg}[\omega(s_t)]\,H^X_{s_t}(\pi\|\pi_0)`, which reaches the actor only;
+      being a cross-entropy and no divergence, it pulls towards the prior's best action, not to its entropy;
     * ``"loss_prior_weight"``, :math:`c_\omega\,(y - \omega(s)\,\ell)^2`, which reaches the prior weight only;
     * ``"loss_prior_critic"``, :math:`c_V\,(V(s_t) - \mathrm{sg}[R_t + \gamma(1-\mathrm{term}_t)V(s_{t+1})])^2`, which
       reaches the critic of raw rewards only (``td_error="original"``).
@@ -252,9 +253,9 @@ class AE2RLoss(LossModule):
         ):
             self.register_coeff_buffer(name, value, device=device)
         if spec.adaptive and prior_weight is not None:
-            self.set_keys(prior_weight=prior_weight.out_keys[0])
+            self.set_keys(prior_weight=_out_key(prior_weight, self.tensor_keys.prior_weight))
         if self._has_critic and critic_network is not None:
-            self.set_keys(value=critic_network.out_keys[0])
+            self.set_keys(value=_out_key(critic_network, self.tensor_keys.value))
 
     def _set_network(self, name: str, network: TensorDictModule | None, apart_from: list[Tensor] | None = None) -> None:
         if network is not None and self._functional:
@@ -279,7 +280,7 @@ class AE2RLoss(LossModule):
             keys: list[NestedKey] = []
             names = self.tensor_keys
             if self._needs_cross_entropy:
-                keys += [*self.actor_network.in_keys, *self.prior.in_keys]
+                keys += [*self.actor_network.in_keys, *self.prior.in_keys, *getattr(self.prior, "draw_keys", ())]
             if self.spec.adaptive:
                 shifted = self.weight_target == "td" and self.spec.bonus == "next"
                 keys += self.prior_weight.in_keys if self.spec.auxiliary or not shifted else []
@@ -320,7 +321,7 @@ class AE2RLoss(LossModule):
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
 
-    @dispatch
+    @dispatch(auto_batch_size=False)  # no guess from the shapes: a single observation has no trailing 1 to tell by
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch of any batch size, and what is worth logging; the batch is left as it is."""
         losses: dict[str, Tensor] = {}
@@ -419,7 +420,10 @@ class AE2RLoss(LossModule):
     def _evaluate(self, name: str, tensordict: TensorDictBase, out_key: NestedKey) -> Tensor:
         network = getattr(self, name)
         with self._params_of(name):
-            return network(tensordict.select(*network.in_keys, strict=False)).get(out_key)
+            value = network(tensordict.select(*network.in_keys, strict=False)).get(out_key, None)
+        if value is None:
+            raise KeyError(f"The {name} writes {network.out_keys}, but no {out_key!r}: set_keys says where to find it.")
+        return value
 
     def _params_of(self, name: str) -> contextlib.AbstractContextManager:
         if not self.functional:
@@ -458,6 +462,11 @@ def _weight_regression(target: Tensor, weight: Tensor, signal: Tensor) -> Tensor
             f" [*B, 1], got {tuple(target.shape)}, {tuple(weight.shape)} and {tuple(signal.shape)}."
         )
     return prior_weight_loss(target, weight, signal)
+
+
+def _out_key(network: TensorDictModuleBase, default: NestedKey) -> NestedKey:
+    """Where a network writes its result: the default if it is one of its keys, else the last of them."""
+    return default if default in network.out_keys else network.out_keys[-1]
 
 
 def _check_option(name: str, value: str, options: tuple[str, ...]) -> None:

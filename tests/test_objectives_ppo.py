@@ -1,0 +1,340 @@
+"""ClipPPOPriorLoss is ClipPPOLoss and AE2RLoss in one, and plain PPO where the prior counts for nothing."""
+
+from __future__ import annotations
+
+import copy
+import warnings
+
+import pytest
+import torch
+from objectives_cases import (
+    gradients,
+    loss_names,
+    make_actor,
+    make_batch,
+    make_constant_weight,
+    make_critic,
+    make_weight,
+    same_tensors,
+    total,
+)
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from torchrl_priors.methods import METHODS
+from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss
+
+
+def make_networks(kind="categorical"):
+    return {
+        "actor_network": make_actor(kind),
+        "critic_network": make_critic(),
+        "prior": make_actor(kind),
+        "prior_weight": make_weight(),
+        "prior_critic_network": make_critic(),
+    }
+
+
+def make_loss(method="ae2r", kind="categorical", **kwargs):
+    return ClipPPOPriorLoss(**{**make_networks(kind), "method": method, **kwargs})
+
+
+def train(loss, data, networks, steps=5):
+    """A few optimiser steps: the losses and gradients of each, and the parameters at the end."""
+    optimizers = [torch.optim.Adam(network.parameters(), lr=1e-2) for network in networks]
+    history = []
+    for _ in range(steps):
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        losses = loss(data)
+        total(losses).backward()
+        history.append(
+            ({key: losses[key].detach() for key in loss_names(losses)}, [gradients(n) for n in networks[:2]])
+        )
+        for optimizer in optimizers:
+            optimizer.step()
+    return history, [{name: p.detach().clone() for name, p in network.named_parameters()} for network in networks[:2]]
+
+
+@pytest.mark.parametrize("functional", [True, False])
+@pytest.mark.parametrize("method", ["ae2r", "aer", "aligned"])
+@pytest.mark.parametrize("kind", ["categorical", "one_hot", "normal"])
+def test_a_weight_of_zero_is_plain_ppo_bit_by_bit(kind, method, functional):
+    actor, critic, prior_critic, data = make_actor(kind), make_critic(), make_critic(), make_batch(kind)
+    plain_actor, plain_critic = copy.deepcopy(actor), copy.deepcopy(critic)
+    options = {"functional": functional, "normalize_advantage": True, "entropy_coeff": 0.01}
+    weight = make_constant_weight(0.0)
+    loss = ClipPPOPriorLoss(actor, critic, make_actor(kind), weight, prior_critic, method=method, **options)
+    plain = ClipPPOLoss(plain_actor, plain_critic, **options)
+    history, parameters = train(loss, data, [actor, critic, prior_critic])
+    plain_history, plain_parameters = train(plain, data, [plain_actor, plain_critic])
+    for (losses, grads), (plain_losses, plain_grads) in zip(history, plain_history, strict=True):
+        assert same_tensors({key: losses[key] for key in plain_losses}, plain_losses)
+        assert all(same_tensors(*pair) for pair in zip(grads, plain_grads, strict=True))
+        assert losses.get("loss_prior", 0.0) == 0.0
+    assert all(same_tensors(*pair) for pair in zip(parameters, plain_parameters, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["categorical", "normal"])
+def test_a_weight_of_one_is_e2r_bit_by_bit(kind):
+    actor, critic, prior, data = make_actor(kind), make_critic(), make_actor(kind), make_batch(kind)
+    twin_actor, twin_critic = copy.deepcopy(actor), copy.deepcopy(critic)
+    ae2r = ClipPPOPriorLoss(actor, critic, prior, make_constant_weight(1.0), make_critic(), method="ae2r")
+    e2r = ClipPPOPriorLoss(twin_actor, twin_critic, prior, method="e2r")
+    history, parameters = train(ae2r, data, [actor, critic])
+    e2r_history, e2r_parameters = train(e2r, data, [twin_actor, twin_critic])
+    for (losses, grads), (e2r_losses, e2r_grads) in zip(history, e2r_history, strict=True):
+        assert same_tensors({key: losses[key] for key in e2r_losses}, e2r_losses)
+        assert all(same_tensors(*pair) for pair in zip(grads, e2r_grads, strict=True))
+    assert all(same_tensors(*pair) for pair in zip(parameters, e2r_parameters, strict=True))
+
+
+@pytest.mark.parametrize("method", ["e2r", "kickstart", "ae2r", "aligned"])
+def test_the_teacher_changes_the_students_gradient(method):
+    networks, data = make_networks(), make_batch()
+    total(ClipPPOLoss(networks["actor_network"], networks["critic_network"])(data)).backward()
+    plain = [gradients(networks[name]) for name in ("actor_network", "critic_network")]
+    for network in networks.values():
+        network.zero_grad()
+    total(ClipPPOPriorLoss(**networks, method=method)(data)).backward()
+    actor, critic = (gradients(networks[name]) for name in ("actor_network", "critic_network"))
+    assert not any(torch.equal(actor[name], plain[0][name]) for name in actor)
+    assert same_tensors(critic, plain[1])
+
+
+def test_teacher_never_changes():
+    networks, data = make_networks(), make_batch()
+    before = copy.deepcopy(dict(networks["prior"].named_parameters()))
+    loss = ClipPPOPriorLoss(**networks)
+    optimizer = torch.optim.AdamW(loss.parameters(), lr=0.1, weight_decay=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        total(loss(data)).backward()
+        optimizer.step()
+    assert same_tensors(before, dict(networks["prior"].named_parameters()))
+
+
+REACHED = {
+    "loss_objective": {"actor_network"},
+    "loss_entropy": {"actor_network"},
+    "loss_critic": {"critic_network"},
+    "loss_prior": {"actor_network"},
+    "loss_prior_weight": {"prior_weight"},
+    "loss_prior_critic": {"prior_critic_network"},
+}
+
+
+@pytest.mark.parametrize("functional", [True, False])
+@pytest.mark.parametrize("td_error", ["original", "shaped"])
+@pytest.mark.parametrize("method", METHODS)
+def test_each_loss_reaches_its_own_network_only(method, td_error, functional):
+    networks, data = make_networks(), make_batch()
+    loss = ClipPPOPriorLoss(**networks, method=method, td_error=td_error, functional=functional)
+    for key in loss_names(loss(data)):
+        for network in networks.values():
+            network.zero_grad()
+        loss(data)[key].backward()
+        reached = {
+            name for name, net in networks.items() if any(p.grad is not None and p.grad.any() for p in net.parameters())
+        }
+        assert reached == REACHED[key]
+
+
+@pytest.mark.parametrize("td_error", ["original", "shaped"])
+@pytest.mark.parametrize("method", METHODS)
+def test_its_losses_are_those_of_the_two_modules(method, td_error):
+    networks, data = make_networks(), make_batch()
+    losses = ClipPPOPriorLoss(**networks, method=method, td_error=td_error, aux_coeff=0.3, gamma=0.9)(data)
+    ppo = ClipPPOLoss(networks["actor_network"], networks["critic_network"])(data)
+    critic = networks["prior_critic_network" if td_error == "original" else "critic_network"]
+    prior = AE2RLoss(
+        *(networks[name] for name in ("actor_network", "prior", "prior_weight")),
+        critic,
+        method=method,
+        td_error=td_error,
+        aux_coeff=0.3,
+        gamma=0.9,
+    )(data)
+    assert same_tensors(losses.to_dict(), {**ppo.to_dict(), **prior.to_dict()})
+
+
+def test_every_parameter_is_listed_once():
+    networks = make_networks()
+    loss = ClipPPOPriorLoss(**networks)
+    parameters = list(loss.parameters())
+    assert len(parameters) == len(set(parameters))
+    assert set(parameters) == {p for network in networks.values() for p in network.parameters()}
+
+
+def test_parameters_stay_shared_after_a_move():
+    loss = make_loss(td_error="shaped").to(torch.double)
+    for name in ("actor_network_params", "critic_network_params"):
+        mine, inner = (dict(getattr(x, name).named_parameters()) for x in (loss, loss.prior_loss))
+        assert all(inner[key] is mine[key] and inner[key].dtype == torch.double for key in mine)
+
+
+def test_an_unshaped_batch_is_refused_rather_than_trained_on():
+    """Without an advantage the loss estimates its own: from the shaped reward, or not at all."""
+    data = make_batch().exclude("advantage", "value_target", ("next", "shaped_reward"))
+    with pytest.raises((KeyError, AttributeError, RuntimeError, TypeError)):
+        make_loss("e2r")(data)
+    make_loss("kickstart")(data)  # no bonus: the reward is the reward
+
+
+def test_own_advantages_are_estimated_from_the_shaped_reward():
+    networks, data = make_networks(), make_batch(batch=(2, 5))
+    data = data.exclude("advantage", "value_target")
+    loss = ClipPPOPriorLoss(**networks, gamma=0.7)
+    gae = GAE(gamma=0.7, lmbda=0.95, value_network=networks["critic_network"])
+    gae.set_keys(reward="shaped_reward")
+    expected = loss(gae(data.copy()))
+    losses = loss(data)
+    for key in loss_names(expected):
+        torch.testing.assert_close(losses[key], expected[key])
+
+
+def test_one_discount_for_the_advantage_and_the_weight():
+    loss = make_loss(gamma=0.7)
+    loss.make_value_estimator()
+    assert loss.value_estimator.gamma == pytest.approx(0.7)
+    loss.make_value_estimator(gamma=0.5)
+    assert loss.prior_loss.gamma == 0.5
+    assert loss.gamma == 0.5
+
+
+def test_reward_key_that_hides_the_bonus_warns():
+    with pytest.warns(UserWarning, match="do not see the prior's bonus"):
+        make_loss("e2r").set_keys(reward="reward")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_loss("kickstart").set_keys(reward="reward")
+        make_loss("e2r").set_keys(reward="my_reward", raw_reward="raw")
+
+
+def test_keys_reach_both_losses():
+    loss = make_loss()
+    loss.set_keys(
+        reward=("a", "shaped"),
+        raw_reward=("a", "raw"),
+        terminated="end",
+        value="v",
+        raw_value="raw_v",
+        prior_log_prob="lp",
+        prior_center="c",
+        prior_bonus="b",
+        prior_weight="w",
+        raw_advantage="adv",
+    )
+    inner = loss.prior_loss.tensor_keys
+    assert (inner.reward, inner.terminated, inner.value) == (("a", "raw"), "end", "raw_v")
+    assert (inner.prior_log_prob, inner.prior_center, inner.prior_bonus) == ("lp", "c", "b")
+    assert (inner.prior_weight, inner.raw_advantage) == ("w", "adv")
+    assert loss.tensor_keys.reward == ("a", "shaped")
+    assert ("next", "a", "raw") in loss.in_keys
+    assert ("next", "lp") in loss.in_keys
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_dispatch(method):
+    loss = make_loss(method)
+    data = make_batch()
+    data["raw_advantage"] = data["advantage"]
+    kwargs = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys}
+    loss.in_keys = [*loss.in_keys, "advantage", "value_target"]
+    values = loss(**kwargs, advantage=data["advantage"], value_target=data["value_target"])
+    expected = loss(data)
+    for key, value in zip(loss.out_keys, values, strict=True):
+        torch.testing.assert_close(value, expected[key])
+
+
+@pytest.mark.parametrize("batch", [(6,), (2, 3)])
+@pytest.mark.parametrize("method", ["ae2r", "aligned"])
+def test_reductions(method, batch):
+    loss = make_loss(method, reduction="none")
+    data = make_batch(batch=batch)
+    each = loss(data)
+    for key in loss_names(each):
+        assert each[key].shape == batch
+    for reduction in ("mean", "sum"):
+        loss.reduction = reduction  # also after construction
+        reduced = loss(data)
+        for key in loss_names(each):
+            torch.testing.assert_close(reduced[key], getattr(each[key], reduction)())
+
+
+def test_mask_key_reaches_both_losses():
+    loss = make_loss(normalize_advantage=False)
+    data = make_batch()
+    mask = torch.tensor([True, True, False, True, False, True])
+    expected = loss(data[mask])
+    data["valid"] = mask.unsqueeze(-1)
+    loss.loss_mask_key = "valid"
+    losses = loss(data)
+    for key in loss_names(expected):
+        torch.testing.assert_close(losses[key], expected[key])
+
+
+@pytest.mark.parametrize("functional", [True, False])
+@pytest.mark.parametrize("td_error", ["original", "shaped"])
+def test_state_dict_restores_the_losses(td_error, functional):
+    loss, other = (make_loss(td_error=td_error, functional=functional) for _ in range(2))
+    data = make_batch()
+    other.load_state_dict(copy.deepcopy(loss.state_dict()))
+    assert same_tensors(loss(data).to_dict(), other(data).to_dict())
+
+
+def test_deep_copy_keeps_parameters_shared_inside():
+    twin = copy.deepcopy(make_loss())
+    for p in twin.actor_network_params.parameters():
+        p.data.zero_()
+    assert not any(p.any() for p in twin.prior_loss.actor_network_params.parameters())
+
+
+@pytest.mark.parametrize("functional", [True, False])
+def test_reset_leaves_the_prior_alone(functional):
+    networks = make_networks()
+    before = {name: copy.deepcopy(network.state_dict()) for name, network in networks.items()}
+    ClipPPOPriorLoss(**networks, functional=functional).reset_parameters_recursive()
+    for name, network in networks.items():
+        for key, value in network.state_dict().items():
+            assert torch.equal(value, before[name][key]) == (name == "prior")
+
+
+@pytest.mark.parametrize("kind", ["categorical", "normal"])
+def test_compiled_forward_gives_the_same_numbers(kind):
+    loss, data = make_loss(kind=kind), make_batch(kind)
+    expected = loss(data)
+    torch._dynamo.reset()
+    losses = torch.compile(loss, backend="aot_eager")(data)
+    for key in loss_names(expected):
+        torch.testing.assert_close(losses[key], expected[key])
+    total(losses).backward()
+    assert all(p.grad is not None for p in loss.actor_network_params.parameters())
+
+
+def test_avec_and_prior_combine():
+    class Loss(AVECMixin, ClipPPOPriorLoss):
+        pass
+
+    networks, data = make_networks(), make_batch()
+    losses, plain = Loss(**networks)(data), ClipPPOPriorLoss(**networks, loss_critic_type="l2")(data)
+    error = networks["critic_network"](data.copy())["state_value"] - data["value_target"]
+    torch.testing.assert_close(losses["loss_critic"], error.var(correction=0))
+    for key in loss_names(plain) - {"loss_critic"}:
+        assert torch.equal(losses[key], plain[key])
+
+
+def test_options_of_ppo_pass_through():
+    loss = make_loss(clip_epsilon=0.3, critic_coeff=0.5, entropy_bonus=False, loss_critic_type="l2")
+    assert loss.clip_epsilon == pytest.approx(0.3)
+    assert loss.critic_coeff == 0.5
+    assert "loss_entropy" not in loss(make_batch())
+    loss.critic_coeff, loss.prior_loss.aux_coeff = 0.25, 0.1
+    assert loss.prior_loss.aux_coeff == pytest.approx(0.1)
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(ValueError, match="Unknown method"):
+        make_loss("ppo")
+    with pytest.raises(ValueError, match="pass critic_network"):
+        make_loss(prior_critic_network=None)
