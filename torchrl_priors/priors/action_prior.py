@@ -170,12 +170,14 @@ class ActionPrior(TensorDictModuleBase):
                 f" {tuple(action.shape)}, and the prior's {type(dist).__name__} is over actions of shape"
                 f" {tuple(expected)} (batch {tuple(tensordict.batch_size)})."
             )
-        try:
-            log_prob = dist.log_prob(action)
-        except ValueError as error:
-            raise ValueError(
-                f"The actions under {self.action_key!r} are outside of the prior's action space: {error}"
-            ) from error
+        if isinstance(dist, d.Categorical) and not isinstance(dist, _ONE_HOT) and not torch.compiler.is_compiling():
+            num_actions = dist.logits.shape[-1]
+            if ((action < 0) | (action >= num_actions)).any():
+                raise ValueError(
+                    f"The action space of the prior differs from the student's: {self.action_key!r} has indices in"
+                    f" [{int(action.min())}, {int(action.max())}], and the prior advises on {num_actions} actions."
+                )
+        log_prob = dist.log_prob(action)
         return log_prob.flatten(tensordict.ndim).sum(-1) if log_prob.ndim > tensordict.ndim else log_prob
 
     def adversary(self) -> ActionPrior:

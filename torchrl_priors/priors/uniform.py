@@ -103,9 +103,9 @@ def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[st
         if actions < 1:
             raise ValueError(f"A uniform prior needs at least one action, got {actions}.")
         return {"logits": torch.zeros(actions)}, d.Categorical, {}
-    if isinstance(actions, OneHot):
+    if isinstance(actions, OneHot) and actions.ndim == 1:
         return {"logits": torch.zeros(actions.shape[-1], device=actions.device)}, OneHotCategorical, {}
-    if isinstance(actions, Categorical):
+    if type(actions) is Categorical and actions.ndim == 0:
         return {"logits": torch.zeros(actions.n, device=actions.device)}, d.Categorical, {}
     if isinstance(actions, Bounded) and actions.dtype.is_floating_point:
         low, high = actions.space.low, actions.space.high
@@ -113,5 +113,6 @@ def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[st
             raise ValueError(f"There is no uniform distribution over unbounded actions: {actions}.")
         return {"low": low.clone(), "high": high.clone()}, _BoxUniform, {"event_dims": low.ndim}
     raise TypeError(
-        f"Expected a number of actions or a spec of kind Categorical, OneHot or (continuous) Bounded, got {actions}."
+        f"Expected a number of actions or a spec of kind Categorical, OneHot or (continuous) Bounded, without the batch"
+        f" dimensions of an environment (env.action_spec_unbatched), got {actions}."
     )
