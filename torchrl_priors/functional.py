@@ -56,7 +56,10 @@ def categorical_entropy(log_probs: Tensor) -> Tensor:
 
 
 def gaussian_cross_entropy(loc: Tensor, scale: Tensor, prior_loc: Tensor, prior_scale: Tensor) -> Tensor:
-    r"""Cross-entropy of two diagonal Gaussians, :math:`\sum_i \frac{\sigma_i^2 + (\mu_i-\mu_{0i})^2}{2\sigma_{0i}^2} + \log\sigma_{0i} + \tfrac12\log 2\pi`.
+    r"""Cross-entropy of two diagonal Gaussians, a sum over the dimensions of the action.
+
+    .. math::
+        H^X = \sum_i \frac{\sigma_i^2 + (\mu_i-\mu_{0i})^2}{2\sigma_{0i}^2} + \log\sigma_{0i} + \tfrac12\log 2\pi
 
     Args:
         loc, scale (Tensor): mean and standard deviation of the student, ``[*B, A]``.
@@ -104,7 +107,9 @@ def has_next_action(done: Tensor, traj_ids: Tensor | None = None, *, time_dim: i
     return torch.cat([same, last], time_dim)
 
 
-def shift_to_next(value: Tensor, boundary_value: Tensor | float, has_next: Tensor, terminated: Tensor, *, time_dim: int) -> Tensor:
+def shift_to_next(
+    value: Tensor, boundary_value: Tensor | float, has_next: Tensor, terminated: Tensor, *, time_dim: int
+) -> Tensor:
     r"""The one-step shift of E2R: the value of step ``t + 1`` where there is one, else what stands in for it.
 
     * where the episode terminated at ``t``: 0 (there is no next state to advise on);
@@ -127,11 +132,17 @@ def shift_to_next(value: Tensor, boundary_value: Tensor | float, has_next: Tenso
     Examples:
         >>> no, yes = False, True
         >>> shift_to_next(
-        ...     torch.tensor([-1.0, -2.0, -3.0]), -9.0, torch.tensor([yes, no, no]), torch.tensor([no, yes, no]), time_dim=0
+        ...     torch.tensor([-1.0, -2.0, -3.0]),
+        ...     -9.0,
+        ...     torch.tensor([yes, no, no]),
+        ...     torch.tensor([no, yes, no]),
+        ...     time_dim=0,
         ... )
         tensor([-2.,  0., -9.])
     """
-    following = torch.cat([value.narrow(time_dim, 1, value.shape[time_dim] - 1), value.narrow(time_dim, 0, 1)], time_dim)
+    following = torch.cat(
+        [value.narrow(time_dim, 1, value.shape[time_dim] - 1), value.narrow(time_dim, 0, 1)], time_dim
+    )
     shifted = torch.where(has_next, following, boundary_value)
     return torch.where(terminated, torch.zeros_like(value), shifted)
 
@@ -163,7 +174,14 @@ def alignment(log_prob: Tensor, cross_entropy: Tensor) -> Tensor:
     return log_prob + cross_entropy
 
 
-def td_residual(value: Tensor, reward: Tensor, next_value: Tensor, terminated: Tensor, gamma: Tensor | float, bonus: Tensor | float = 0.0) -> Tensor:
+def td_residual(
+    value: Tensor,
+    reward: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    gamma: Tensor | float,
+    bonus: Tensor | float = 0.0,
+) -> Tensor:
     r"""One-step TD error, :math:`\delta_t = R_t + B_t + \gamma(1-\mathrm{term}_t)V(s_{t+1}) - V(s_t)`.
 
     It is minus the residual of the critic's loss (the paper's Eq. for :math:`\mathcal L_V`), and with ``bonus=0`` it is
@@ -180,9 +198,10 @@ def td_residual(value: Tensor, reward: Tensor, next_value: Tensor, terminated: T
 def prior_weight_loss(target: Tensor, weight: Tensor, signal: Tensor) -> Tensor:
     r"""Squared error of the prior weight, :math:`\mathcal L_\omega = (y - \omega(s)\,\ell)^2`, elementwise.
 
-    With ``weight_target="td"`` (the paper's Eq. for :math:`\mathcal L_\omega`) :math:`y = E_t = V(s_t)-R_t-\gamma V(s_{t+1})`,
-    which is minus :func:`td_residual` without a bonus, and :math:`\ell` is the log-probability in the bonus. With
-    ``weight_target="advantage"`` :math:`y` is the advantage on raw rewards and :math:`\ell` the :func:`alignment`.
+    With ``weight_target="td"`` (the paper's Eq. for :math:`\mathcal L_\omega`)
+    :math:`y = E_t = V(s_t)-R_t-\gamma V(s_{t+1})`, which is minus :func:`td_residual` without a bonus, and
+    :math:`\ell` is the log-probability in the bonus. With ``weight_target="advantage"`` :math:`y` is the advantage on
+    raw rewards and :math:`\ell` the :func:`alignment`.
     The gradient reaches ``weight`` only: pass ``target`` and ``signal`` detached.
 
     Examples:
@@ -193,7 +212,7 @@ def prior_weight_loss(target: Tensor, weight: Tensor, signal: Tensor) -> Tensor:
 
 
 def policy_gradient_loss(log_prob: Tensor, advantage: Tensor) -> Tensor:
-    r"""Surrogate whose gradient is the policy gradient, :math:`-\log\pi(a_t|s_t)\,\hat A_t`; pass the advantage detached.
+    r"""Surrogate whose gradient is the policy gradient, :math:`-\log\pi(a_t|s_t)\,\hat A_t`, for a detached advantage.
 
     Examples:
         >>> policy_gradient_loss(torch.tensor(-0.5), torch.tensor(2.0))

@@ -17,7 +17,8 @@ class MethodSpec:
             (log pi0(a_{t+1}|s_{t+1})).
         auxiliary: whether the cross-entropy H^X(pi || pi0) is added to the policy loss.
         adaptive: whether both are scaled by a learned prior weight w(s) (else w = 1).
-        weight_target: what the prior weight regresses on: the critic's ``"td"`` error (the paper) or the ``"advantage"``.
+        weight_target: what the prior weight regresses on: the critic's ``"td"`` error (the paper) or the
+            ``"advantage"``.
     """
 
     bonus: Literal["none", "current", "next"]

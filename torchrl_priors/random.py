@@ -1,6 +1,6 @@
 """Counter-based random numbers: row ``i`` of a batch draws from its own stream, whatever else is in the batch.
 
-A :class:`torch.Generator` hands out numbers in the order of the tensor, so a run's draws would depend on its neighbours.
+A :class:`torch.Generator` hands out numbers in the order of the tensor: a run's draws would depend on its neighbours.
 Philox4x32-10 (Salmon et al., "Parallel Random Numbers: As Easy as 1, 2, 3", 2011) is a pure function of a key and a
 counter instead: it needs no state, gives the same numbers on every device, and fuses into a compiled step. PyTorch has
 the same generator in ``torch.func._random``, but (as of 2.13) private and without a CPU kernel.
@@ -27,7 +27,9 @@ def _mulhilo(multiplier: int, x: Tensor) -> tuple[Tensor, Tensor]:
     return ((product >> 32) + x) & _MASK, product & _MASK
 
 
-def philox(key: Tensor, counter: tuple[Tensor | int, Tensor | int], rounds: int = 10) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def philox(
+    key: Tensor, counter: tuple[Tensor | int, Tensor | int], rounds: int = 10
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Philox4x32: four 32-bit words for a 64-bit key and the two low words of the counter.
 
     Args:

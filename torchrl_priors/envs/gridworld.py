@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,6 +12,9 @@ from torchrl.envs import EnvBase
 
 from torchrl_priors.envs.worlds import KINDS, GridWorlds, windows
 from torchrl_priors.random import derive_key, uniform
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["GridMaps", "GridWorldEnv", "transition"]
 
@@ -52,7 +55,8 @@ def transition(
         maps (GridMaps): the worlds.
         position (Tensor): int64 ``[*B]``, where the agents are.
         action (Tensor): int64 ``[*B]``, in ``[0, 4)``: up, right, down, left.
-        slip (Tensor): ``[*B]`` in [0, 1); below ``noise`` a uniform action (the same draw chooses it) replaces the agent's.
+        slip (Tensor): ``[*B]`` in [0, 1); below ``noise`` a uniform action replaces the agent's (the same draw chooses
+            it).
         end (Tensor): ``[*B]`` in [0, 1); below ``end_prob`` the episode ends.
 
     Keyword Args:
@@ -104,6 +108,14 @@ class GridWorldEnv(EnvBase):
     """
 
     batch_locked = True
+    key: Tensor
+    clock: Tensor
+    start: Tensor
+    view: Tensor
+    next_position: Tensor
+    reward: Tensor
+    terminal: Tensor
+    state: Tensor
 
     def __init__(
         self,
@@ -152,13 +164,12 @@ class GridWorldEnv(EnvBase):
     def _observe(self, position: Tensor) -> dict[str, Tensor]:
         return {"observation": self.view[position], "state": self.state[position].long(), "position": position}
 
-    def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
-        position = self.start
-        if tensordict is not None and "_reset" in tensordict.keys() and "position" in tensordict.keys():
-            position = torch.where(tensordict["_reset"].view(self.batch_size), position, tensordict["position"])
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         done = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return TensorDict(
-            {**self._observe(position.clone()), "done": done, "terminated": done.clone()}, self.batch_size, device=self.device
+            {**self._observe(self.start.clone()), "done": done, "terminated": done.clone()},
+            self.batch_size,
+            device=self.device,
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -185,7 +196,7 @@ class GridWorldEnv(EnvBase):
         self.key = derive_key(seed, torch.arange(self.batch_size[0], device=self.device), "env")
         self.clock = torch.zeros_like(self.clock)
 
-    def render(self, world: int = 0, **overlays):
+    def render(self, world: int = 0, **overlays: Any) -> Figure:
         """Picture of one world: start, walls, terminal cells and rewards; returns a matplotlib figure.
 
         Args:
@@ -197,7 +208,7 @@ class GridWorldEnv(EnvBase):
 
         size, one = self.worlds.size, self.worlds[world].cpu()
 
-        def square(values):
+        def square(values: Any) -> Any:
             return None if values is None else torch.as_tensor(values).cpu().view(size, size).numpy()
 
         return grid_world(

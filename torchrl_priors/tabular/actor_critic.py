@@ -4,7 +4,7 @@ Each run is a row; nothing couples two rows. A run's tables (policy, critics, pr
 floats (a cache line) per state. The policy and the prior weight are frozen during an episode: what a visit teaches is
 added to the record's *pending* fields and takes effect when the state is first visited in a later episode, which is
 the episode's summed gradient step without a pass over the episode. The losses are those of
-:mod:`torchrl_priors.functional`, differentiated by :func:`torch.func.grad`, and the whole step compiles into one kernel.
+:mod:`torchrl_priors.functional`, differentiated by :func:`torch.func.grad`; the whole step compiles into one kernel.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def pick(table: Tensor, action: Tensor) -> Tensor:
 
 
 def choose(logits: Tensor, draw: Tensor, greedy: Tensor) -> Tensor:
-    """Action of the softmax policy with ``logits [4, N]``: by inversion of ``draw``, or the first best if ``greedy``."""
+    """Action of the softmax policy with ``logits [4, N]``: by inversion of ``draw``, or the first best if greedy."""
     mass = logits.softmax(0)
     below = mass[0]
     sampled = (draw >= below).long()
@@ -197,15 +197,22 @@ _visit_gradient = grad(_visit_loss, argnums=(0, 1))
 
 
 def advance(
-    clock: Tensor, maps: GridMaps, advice_table: Tensor, runs: Runs, carry: Carry, records: Tensor, log: Tensor, hyper: Hyper
+    clock: Tensor,
+    maps: GridMaps,
+    advice_table: Tensor,
+    runs: Runs,
+    carry: Carry,
+    records: Tensor,
+    log: Tensor,
+    hyper: Hyper,
 ) -> Carry:
     """Take one step in every run that is not finished, and learn from it; ``records`` and ``log`` change in place.
 
     Args:
         clock (Tensor): int64 scalar, the number of this step; the random draws depend on it and on ``runs.key`` alone.
         maps (GridMaps): the worlds.
-        advice_table (Tensor): float32 ``[tables * C * 8]``: log pi0 of the four actions, whether the state is degraded (and
-            padding), for each state of each table.
+        advice_table (Tensor): float32 ``[tables * C * 8]``: for each state of each table, log pi0 of the four actions,
+            whether the state is degraded, and padding.
         runs (Runs): ``N`` rows.
         carry (Carry): from the step before or :func:`initial_carry`.
         records (Tensor): from :func:`new_records`.
@@ -230,7 +237,9 @@ def advance(
     prior_log_prob = pick(carry.advice, carry.action)
     current_bonus = runs.bonus_current * F.prior_bonus(weight, prior_log_prob)
 
-    def learn(value: Tensor, raw_value: Tensor, next_bonus: Tensor, terminated: Tensor, stays: Tensor):
+    def learn(
+        value: Tensor, raw_value: Tensor, next_bonus: Tensor, terminated: Tensor, stays: Tensor
+    ) -> tuple[Tensor, ...]:
         """What this visit changes, given the value of the next state, in this order: critics, then actor and weight."""
         delta = F.td_residual(here.value, reward, value, terminated, hyper.gamma, current_bonus + next_bonus)
         raw_delta = F.td_residual(here.raw_value, reward, raw_value, terminated, hyper.gamma)

@@ -52,8 +52,8 @@ def parse_prior(name: str) -> PriorSpec:
 def sample_degraded(q: Tensor, visited: Tensor, seeds: Tensor, count: int, temperature: float) -> Tensor:
     """States to degrade: drawn from softmax(max_a Q / temperature) over the visited ones until ``count`` are distinct.
 
-    Drawing until enough distinct ones are found is drawing without replacement, which the Gumbel top-k trick does in one
-    go. A world with fewer visited states gets them all.
+    Drawing until enough distinct ones are found is drawing without replacement, which the Gumbel top-k trick does in
+    one go. A world with fewer visited states gets them all.
 
     Args:
         q (Tensor): action values, ``[W, C, 4]``.
@@ -102,6 +102,6 @@ def advice_tables(q: Tensor, degraded: dict[int, Tensor], temperature: float) ->
     none = torch.zeros(worlds, states, dtype=torch.bool, device=q.device)
     table = torch.zeros(worlds, len(priors), states, ADVICE_WIDTH, device=q.device)
     for index, (prior, mask) in enumerate(zip(priors, [none, none, *degraded.values()], strict=True)):
-        table[:, index, :, :4] = prior.get_dist(everywhere).logits
+        table[:, index, :, :4] = prior.get_dist(everywhere).logits  # type: ignore[attr-defined]
         table[:, index, :, 4] = mask
     return table.flatten()

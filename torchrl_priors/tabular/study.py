@@ -33,7 +33,7 @@ class StudentConfig:
 
     Attributes:
         hyper: what all runs share.
-        lr_weight: learning rate of the prior weight, by method or ``"default"``.
+        lr_weight: learning rate of the prior weight by what it regresses on, ``"td"`` or ``"advantage"``.
         td_error: ``"original"`` or ``"shaped"``, the critic in the prior weight's loss.
         bonus_coeff: coefficient of the bonus.
         aux_coeff: coefficient of the auxiliary loss.
@@ -64,14 +64,18 @@ def runs_of(methods: Sequence[str], priors: Sequence[str]) -> list[tuple[str, st
         >>> runs_of(["none", "er"], ["expert", "random_15"])
         [('none', ''), ('er', 'expert'), ('er', 'random_15')]
     """
-    return [
-        (method, prior) for method in methods for prior in ([""] if method == "none" else priors)
-    ]
+    return [(method, prior) for method in methods for prior in ([""] if method == "none" else priors)]
 
 
 @torch.no_grad()
 def train_teachers(
-    worlds: GridWorlds, seeds: Tensor, hyper: TeacherHyper, *, steps: int, compile: bool = False, progress: Progress = lambda n: None
+    worlds: GridWorlds,
+    seeds: Tensor,
+    hyper: TeacherHyper,
+    *,
+    steps: int,
+    compile: bool = False,
+    progress: Progress = lambda n: None,
 ) -> tuple[Tensor, Tensor]:
     """Tabular Q-learning in every world.
 
@@ -90,9 +94,8 @@ def train_teachers(
     """
     count, cells, device = len(worlds), worlds.num_cells, worlds.kind.device
     rows = -(-count // _LANES) * _LANES
-    maps = GridMaps.from_worlds(worlds)
     # Padding rows must have worlds of their own: a teacher's table is its world's.
-    padded = torch.cat([worlds, worlds[:1].expand(rows - count)]) if rows > count else worlds
+    padded: GridWorlds = worlds[torch.arange(rows, device=device) % count]
     maps = GridMaps.from_worlds(padded)
     start = padded.start + torch.arange(rows, device=device) * cells
     teachers = Teachers(
@@ -127,22 +130,22 @@ def build_runs(
     for method, prior in pairs:
         spec, degradation = get_method(method), parse_prior(prior or "expert")
         table = 2 + list(degraded).index(degradation.structural) if degradation.structural else 0
-        values = {
+        values: dict[str, Tensor | float] = {
             "key": derive_key(seeds, "student", method, prior),
             "start": worlds.start + world * cells,
             "advice": (world * tables + table) * cells,
             "adversary": (world * tables + 1) * cells,
-            "degrade_prob": degradation.random,
-            "bonus_current": config.bonus_coeff * (spec.bonus == "current"),
-            "bonus_next": config.bonus_coeff * (spec.bonus == "next"),
-            "aux_coeff": config.aux_coeff * spec.auxiliary,
+            "degrade_prob": float(degradation.random),
+            "bonus_current": float(config.bonus_coeff * (spec.bonus == "current")),
+            "bonus_next": float(config.bonus_coeff * (spec.bonus == "next")),
+            "aux_coeff": float(config.aux_coeff * spec.auxiliary),
             "adaptive": torch.full((count,), spec.adaptive, device=device),
             "advantage_target": torch.full((count,), spec.weight_target == "advantage", device=device),
             "shaped": torch.full((count,), config.td_error == "shaped", device=device),
-            "lr_weight": config.lr_weight.get(method, config.lr_weight["default"]),
+            "lr_weight": float(config.lr_weight[spec.weight_target]),
         }
         for name, value in values.items():
-            filled = value if isinstance(value, Tensor) else torch.full((count,), float(value), device=device)
+            filled = torch.full((count,), value, device=device) if isinstance(value, float) else value
             rows[name].append(filled)
     # [pair, world] -> world-major rows, so that the runs of a world share its tables in the cache
     return Runs(**{name: torch.stack(values, 1).flatten() for name, values in rows.items()})
@@ -197,4 +200,6 @@ def train_students(
         steps = int(carry.steps[:wanted].sum())
         progress(steps - done)
         done = steps
-    return log.view(rows, hyper.eval_points, len(LOG_FIELDS))[:wanted].view(len(worlds), len(pairs), hyper.eval_points, -1)
+    return log.view(rows, hyper.eval_points, len(LOG_FIELDS))[:wanted].view(
+        len(worlds), len(pairs), hyper.eval_points, -1
+    )

@@ -37,8 +37,11 @@ class BatchTransform(Transform):
             " postproc of a collector, in a replay buffer, or call it on a batch."
         )
 
-    def _call(self, next_tensordict: TensorDictBase) -> NoReturn:
-        self._refuse()
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        # what a replay buffer calls for a transform that was appended with invert=True
+        if self.parent is not None:
+            self._refuse()
+        return self.forward(next_tensordict)
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:
         value = tensordict.get(key, None)

@@ -1,0 +1,1 @@
+"""Experiments with soft action priors, run from the command line."""

@@ -1,0 +1,102 @@
+"""A run's folder: its resolved configuration, and files that are either whole or not there."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["RunFolder", "digest"]
+
+
+def digest(config: dict[str, Any]) -> str:
+    """Eight characters that tell two configurations apart."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        flat.update(_flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
+    return flat
+
+
+class RunFolder:
+    """A folder for the results of one configuration, to be continued by the same configuration only.
+
+    Args:
+        path (Path): created if needed.
+        config (dict): everything that the results depend on, as plain values.
+        text (str): the resolved configuration as the user may read it, kept as ``config.yaml``.
+
+    Raises:
+        OSError: the folder cannot be written.
+        ValueError: it holds results of another configuration; the message names what differs.
+    """
+
+    def __init__(self, path: Path, config: dict[str, Any], text: str) -> None:
+        self.path = path
+        stamp = path / "config.json"
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            if stamp.exists():
+                self._check_same(json.loads(stamp.read_text()), config)
+            self.write("config.yaml", lambda temporary: temporary.write_text(text))
+            self.write(
+                "config.json", lambda temporary: temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
+            )
+        except OSError as error:
+            raise OSError(f"Cannot write the results to out={path}: {error}") from error
+
+    def _check_same(self, theirs: dict[str, Any], ours: dict[str, Any]) -> None:
+        before, now = _flatten(theirs), _flatten(ours)
+        changed = [
+            f"{name}: {before.get(name, 'absent')} -> {now.get(name, 'absent')}"
+            for name in sorted(before.keys() | now.keys())
+            if before.get(name, "absent") != now.get(name, "absent")
+        ]
+        if changed:
+            raise ValueError(
+                f"out={self.path} holds results of another configuration ({'; '.join(changed)}): choose another "
+                "folder, or leave `out` to its default, which differs for each configuration."
+            )
+
+    def write(self, name: str, writer: Callable[[Path], Any]) -> Path:
+        """Have ``writer`` fill a temporary file, then put it in place in one step."""
+        target = self.path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(f".{os.getpid()}.{target.name}")
+        try:
+            writer(temporary)
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return target
+
+    def has(self, name: str) -> bool:
+        """Whether the arrays ``<name>.npz`` are there."""
+        return (self.path / f"{name}.npz").exists()
+
+    def arrays(self, name: str, compute: Callable[[], dict[str, np.ndarray]] | None = None) -> dict[str, np.ndarray]:
+        """The arrays of ``<name>.npz``, computed and kept if they are not there yet."""
+        path = self.path / f"{name}.npz"
+        if compute is None or path.exists():
+            try:
+                with np.load(path, allow_pickle=False) as stored:
+                    return dict(stored)
+            except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+                raise ValueError(f"{path} is damaged ({error}): delete it to have it computed again.") from error
+        arrays = compute()
+
+        def save(temporary: Path) -> None:
+            with temporary.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+
+        self.write(f"{name}.npz", save)
+        return arrays
