@@ -23,6 +23,9 @@ class BatchTransform(Transform):
     Their ``forward`` does the work: as a plain call on a batch, as the ``postproc`` of a collector, and in a replay
     buffer when it is sampled (``rb.append_transform(transform)``) or written (``rb.append_transform(transform,
     invert=True)``), alone or in a :class:`~torchrl.envs.Compose`.
+
+    A sampler of slices returns them back to back: reshape the sample to ``[slices, slice_len]`` first, with a transform
+    of the buffer or after sampling, lest the end of a slice continue with the beginning of another of its trajectory.
     """
 
     def set_container(self, container: Transform | EnvBase) -> None:

@@ -1,0 +1,133 @@
+"""Claims about the reward bonus."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from trajectories import STATES, actor, prior, trajectories
+
+from torchrl_priors.methods import METHODS
+from torchrl_priors.prior_weight import PriorWeight
+from torchrl_priors.transforms import PriorBonus, PriorLogProb
+
+
+@pytest.fixture
+def batch() -> TensorDict:
+    return PriorLogProb(prior(), actor(), time_dim=1, centering="policy")(trajectories(3, 8, ids=True))
+
+
+@pytest.fixture
+def weight() -> PriorWeight:
+    weight = PriorWeight.table(STATES)
+    nn.init.normal_(next(weight.parameters()))
+    return weight
+
+
+def at(weight: PriorWeight, state: torch.Tensor) -> torch.Tensor:
+    (logits,) = weight.parameters()
+    return logits[state].sigmoid().detach()
+
+
+@pytest.mark.parametrize("centering", ["none", "policy"])
+def test_next_weighs_the_advice_on_the_next_state(batch: TensorDict, weight: PriorWeight, centering: Any) -> None:
+    PriorBonus(weight, centering=centering)(batch)
+    advice = batch["next", "prior_log_prob"] + (batch["next", "prior_center"] if centering == "policy" else 0)
+    torch.testing.assert_close(batch["next", "prior_bonus"], at(weight, batch["next", "state"]) * advice)
+    terminated = batch["next", "terminated"]
+    assert terminated.any()
+    assert (batch["next", "prior_bonus"][terminated] == 0).all()
+    assert (batch["next", "prior_bonus"][~terminated] != 0).any()
+
+
+@pytest.mark.parametrize("centering", ["none", "policy"])
+def test_current_weighs_the_advice_on_the_state(batch: TensorDict, weight: PriorWeight, centering: Any) -> None:
+    PriorBonus(weight, shift="current", centering=centering)(batch)
+    advice = batch["prior_log_prob"] + (batch["prior_center"] if centering == "policy" else 0)
+    torch.testing.assert_close(batch["next", "prior_bonus"], at(weight, batch["state"]) * advice)
+    assert (batch["next", "prior_bonus"][batch["next", "terminated"]] != 0).any()
+
+
+def test_reward_is_never_touched(batch: TensorDict, weight: PriorWeight) -> None:
+    before = batch.clone()
+    PriorBonus(weight, bonus_coeff=0.25)(batch)
+    assert (batch.select(*before.keys(True, True)) == before).all()
+    assert set(batch.keys(True, True)) - set(before.keys(True, True)) == {
+        ("next", "prior_bonus"),
+        ("next", "shaped_reward"),
+    }
+    expected = before["next", "reward"] + 0.25 * batch["next", "prior_bonus"]
+    torch.testing.assert_close(batch["next", "shaped_reward"], expected)
+
+
+def test_no_weight_is_a_weight_of_one(batch: TensorDict) -> None:
+    without = PriorBonus()(batch.clone())
+    with_one = PriorBonus(PriorWeight.constant(1.0))(batch.clone())
+    assert (without == with_one).all()
+
+
+def test_weight_of_zero_leaves_the_reward_bitwise(batch: TensorDict) -> None:
+    PriorBonus(PriorWeight.constant(0.0))(batch)
+    assert torch.equal(batch["next", "shaped_reward"], batch["next", "reward"])
+
+
+def test_weight_is_evaluated_anew_at_each_call(batch: TensorDict, weight: PriorWeight) -> None:
+    transform = PriorBonus(weight)
+    first = transform(batch)["next", "prior_bonus"].clone()
+    next(weight.parameters()).data.sub_(1.0)
+    second = transform(batch)["next", "prior_bonus"]
+    advised = first != 0
+    assert (second.abs() < first.abs())[advised].all()
+
+
+def test_coefficient_can_be_scheduled(batch: TensorDict) -> None:
+    transform = PriorBonus(bonus_coeff=1.0)
+    transform.bonus_coeff.fill_(0.0)
+    assert torch.equal(transform(batch)["next", "shaped_reward"], batch["next", "reward"])
+    other = PriorBonus()
+    other.load_state_dict(transform.state_dict())
+    assert other.bonus_coeff == 0
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_its_bonus(batch: TensorDict, weight: PriorWeight, method: str) -> None:
+    bonus = PriorBonus.from_method(method, weight)(batch)["next", "prior_bonus"]
+    following, current = batch["next", "prior_log_prob"], batch["prior_log_prob"]
+    expected = {
+        "er": current,
+        "e2r": following,
+        "aer": at(weight, batch["state"]) * current,
+        "ae2r": at(weight, batch["next", "state"]) * following,
+    }.get(method, torch.zeros_like(current))
+    torch.testing.assert_close(bonus, expected)
+
+
+def test_methods_without_a_bonus_need_no_log_probs() -> None:
+    batch = PriorBonus.from_method("kickstart")(trajectories(4))
+    assert torch.equal(batch["next", "shaped_reward"], batch["next", "reward"])
+
+
+def test_adaptive_methods_need_a_weight() -> None:
+    with pytest.raises(ValueError, match="pass prior_weight"):
+        PriorBonus.from_method("ae2r")
+    with pytest.raises(ValueError, match="Unknown method"):
+        PriorBonus.from_method("a2er")
+
+
+def test_bad_settings_and_batches_are_refused(batch: TensorDict) -> None:
+    with pytest.raises(ValueError, match="Unknown shift"):
+        PriorBonus(shift="previous")
+    with pytest.raises(ValueError, match="must not be overwritten"):
+        PriorBonus(out_keys=["bonus", ("next", "reward")])
+    with pytest.raises(ValueError, match="one for the shaped reward"):
+        PriorBonus(out_keys=["bonus"])
+    with pytest.raises(KeyError, match="Run PriorLogProb first"):
+        PriorBonus()(trajectories(4))
+    with pytest.raises(KeyError, match="with centering='prior'"):
+        PriorBonus(centering="prior")(batch.exclude(("next", "prior_center")))
+    batch["next", "reward"] = torch.zeros(3, 8, 2)
+    with pytest.raises(ValueError, match="of shape"):
+        PriorBonus()(batch)
