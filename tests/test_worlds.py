@@ -20,7 +20,7 @@ def sequential_probabilities(wall_prob: float, object_prob: float) -> list[float
 
 
 def map_of(*lines: str, window: int = 3) -> GridWorlds:
-    """A world drawn in characters: ``.`` empty, ``#`` wall, ``A`` 10, ``B`` 5, ``C`` 1, and ``abc`` the negative ones."""
+    """A world drawn in characters: ``.`` empty, ``#`` wall, ``ABC`` +10, +5 and +1, ``abc`` what they are negated."""
     kind = torch.tensor([[".#AaBbCc".index(cell) for cell in line] for line in lines])
     middle = len(lines) // 2 * len(lines) + len(lines) // 2
     return GridWorlds.from_kinds(kind.unsqueeze(0), torch.tensor([middle]), window)
