@@ -51,6 +51,14 @@ def test_current_weighs_the_advice_on_the_state(batch: TensorDict, weight: Prior
     assert (batch["next", "prior_bonus"][batch["next", "terminated"]] != 0).any()
 
 
+def test_terminal_observations_need_not_be_valid() -> None:
+    batch = trajectories(4, ends=1.0)
+    batch["next", "prior_log_prob"] = torch.zeros(4, 1)
+    batch["next", "observation"] = torch.full((4, 2), torch.nan)
+    PriorBonus(PriorWeight(nn.Linear(2, 1)))(batch)
+    assert torch.equal(batch["next", "shaped_reward"], batch["next", "reward"])
+
+
 def test_reward_is_never_touched(batch: TensorDict, weight: PriorWeight) -> None:
     before = batch.clone()
     PriorBonus(weight, bonus_coeff=0.25)(batch)

@@ -225,7 +225,10 @@ class RandomDegradation(Degradation):
         mask = tensordict.get(self.draw_key, None)
         if mask is None:
             shape = (*tensordict.batch_size, 1)
-            mask = (torch.rand(shape, generator=self.generator) < self.p).to(tensordict.device)
+            device = tensordict.device
+            if device is None and self.in_keys:
+                device = tensordict.get(self.in_keys[0]).device
+            mask = (torch.rand(shape, generator=self.generator, device="cpu") < self.p).to(device)
             tensordict.set(self.draw_key, mask)
         _check_bool(mask)
         return mask
