@@ -442,6 +442,16 @@ def test_state_table_reads_the_entry_of_each_world_and_state(
             assert torch.equal(value["value"][world, step], table[world, state[world, step]])
 
 
+def test_learned_table_can_be_reset_and_a_given_one_stays() -> None:
+    learned = StateTable(nn.Parameter(torch.ones(3)), in_key="state", out_key="value")
+    given = StateTable(torch.ones(3), in_key="state", out_key="value")
+    learned.reset_parameters_recursive()
+    with pytest.warns(UserWarning, match="did not find any parameters"):
+        given.reset_parameters_recursive()
+    assert torch.equal(learned.table.detach(), torch.zeros(3))
+    assert torch.equal(given.table, torch.ones(3))
+
+
 def test_masked_one_hot_policies_are_scored() -> None:
     class Masked(nn.Module):
         def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

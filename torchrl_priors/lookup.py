@@ -74,6 +74,14 @@ class StateTable(TensorDictModuleBase):
         if self.learned:
             nn.init.zeros_(self.table)
 
+    def _reset_parameters(self, module: nn.Module) -> bool:
+        # TorchRL resets the children of a network; a table has none
+        any_reset = super()._reset_parameters(module)
+        if module is self:
+            self.reset_parameters()
+            any_reset = any_reset or self.learned
+        return any_reset
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the entries at the states of ``tensordict``."""
         state = read_state(tensordict, self.in_keys[0])
