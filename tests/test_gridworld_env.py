@@ -263,7 +263,7 @@ def test_render_draws_the_world_that_was_asked_for():
     [
         {"policy": torch.zeros(49, dtype=torch.int64)},
         {"prior_weight": torch.full((49,), 0.5)},
-        {"degraded": torch.arange(49) == 3},
+        {"degraded": torch.arange(49) == 18},
     ],
 )
 def test_render_takes_overlays_per_cell(overlay):
