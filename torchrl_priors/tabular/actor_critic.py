@@ -20,7 +20,7 @@ from torchrl_priors import functional as F
 from torchrl_priors.envs.gridworld import GridMaps, transition
 from torchrl_priors.random import uniform
 
-__all__ = ["ADVICE_WIDTH", "LOG_FIELDS", "Carry", "Hyper", "Runs", "advance", "initial_carry", "new_records"]
+__all__ = ["ADVICE_WIDTH", "LOG_FIELDS", "Carry", "Hyper", "Runs", "advance", "initial_carry", "new_log", "new_records"]
 
 # The fields of a record; the four logits and their pending change come first.
 _LOGITS, _PENDING, _VALUE, _RAW_VALUE, _WEIGHT, _WEIGHT_PENDING, _EPISODE, _USED = 0, 4, 8, 9, 10, 11, 12, 13
@@ -112,8 +112,13 @@ class Carry(NamedTuple):
 
 
 def new_records(rows: int, states: int, device: torch.device | str | None = None) -> Tensor:
-    """Tables of fresh runs, all zero: float32 ``[rows * states * 16]``."""
-    return torch.zeros(rows * states * _WIDTH, device=device)
+    """Tables of fresh runs, all zero: float32 ``[(rows * states + 1) * 16]``; the last record is a spare."""
+    return torch.zeros((rows * states + 1) * _WIDTH, device=device)
+
+
+def new_log(rows: int, points: int, device: torch.device | str | None = None) -> Tensor:
+    """Room for the evaluation episodes of all runs: float32 ``[(rows * points + 1) * 8]``, the last entry is a spare."""
+    return torch.zeros((rows * points + 1) * len(LOG_FIELDS), device=device)
 
 
 def pick(table: Tensor, action: Tensor) -> Tensor:
@@ -164,7 +169,8 @@ def _read(records: Tensor, at: Tensor, episode: Tensor) -> _Visible:
 
 
 def _advice(advice_table: Tensor, table: Tensor) -> Tensor:
-    return advice_table[table * ADVICE_WIDTH + torch.arange(5, device=table.device).unsqueeze(1)]
+    # One gather each: with a vector of fields the whole index would be computed again for every field.
+    return torch.stack([advice_table[table * ADVICE_WIDTH + field] for field in range(5)])
 
 
 def _visit_loss(
@@ -216,13 +222,14 @@ def advance(
         runs (Runs): ``N`` rows.
         carry (Carry): from the step before or :func:`initial_carry`.
         records (Tensor): from :func:`new_records`.
-        log (Tensor): float32 ``[N * eval_points * 8]``, the evaluation episodes, see :data:`LOG_FIELDS`.
+        log (Tensor): from :func:`new_log`, the evaluation episodes.
         hyper (Hyper): what all runs share.
 
     Returns:
         Carry: the same rows one step later.
     """
-    rows, states = runs.key.shape[0], records.shape[0] // (runs.key.shape[0] * _WIDTH)
+    rows = runs.key.shape[0]
+    states = (records.shape[0] // _WIDTH - 1) // rows
     row = torch.arange(rows, device=clock.device)
     draw, slip, end, degrade = uniform(runs.key, clock)
     active = carry.points < hyper.eval_points
@@ -295,9 +302,9 @@ def advance(
     learned = [torch.where(done, last, more) for last, more in zip(at_end, go_on, strict=True)]
     scalars = torch.stack([learned[1], learned[2], here.weight, learned[3], carry.episode])
     field = torch.arange(_USED, device=clock.device).unsqueeze(1)
-    at = (row * states + state) * _WIDTH + field
-    changed = torch.where(training, torch.cat([here.logits, learned[0], scalars]), records[at])
-    records.index_put_((at,), changed)
+    # Rows that are not training write to the spare record, which nobody reads.
+    at = torch.where(training, row * states + state, rows * states) * _WIDTH + field
+    records.index_put_((at,), torch.cat([here.logits, learned[0], scalars]))
 
     degraded = carry.advice[4]
     seen = torch.stack([weight, weight.square(), torch.ones_like(weight)])
@@ -305,8 +312,8 @@ def advance(
     visit = torch.cat([torch.stack([reward, torch.ones_like(reward)]), degraded * seen, other])
     episode_log = carry.log + torch.where(tested, visit, 0.0)
     field = torch.arange(len(LOG_FIELDS), device=clock.device).unsqueeze(1)
-    at = (row * hyper.eval_points + carry.points.clamp_max(hyper.eval_points - 1)) * len(LOG_FIELDS) + field
-    log.index_put_((at,), torch.where(tested, episode_log, log[at]))
+    at = torch.where(tested, row * hyper.eval_points + carry.points, rows * hyper.eval_points)
+    log.index_put_((at * len(LOG_FIELDS) + field,), episode_log)
     return Carry(
         position,
         action,

@@ -13,7 +13,7 @@ from torchrl_priors.envs.gridworld import GridMaps
 from torchrl_priors.envs.worlds import GridWorlds
 from torchrl_priors.methods import get_method
 from torchrl_priors.random import derive_key
-from torchrl_priors.tabular.actor_critic import LOG_FIELDS, Hyper, Runs, advance, initial_carry, new_records
+from torchrl_priors.tabular.actor_critic import LOG_FIELDS, Hyper, Runs, advance, initial_carry, new_log, new_records
 from torchrl_priors.tabular.advice import advice_tables, parse_prior
 from torchrl_priors.tabular.q_learning import TeacherHyper, Teachers, q_step
 
@@ -189,7 +189,7 @@ def train_students(
     runs = Runs(*(_pad(value, rows) for value in runs))
     carry = initial_carry(maps, advice, runs, hyper)
     records = new_records(rows, worlds.num_cells, device)
-    log = torch.zeros(rows * hyper.eval_points * len(LOG_FIELDS), device=device)
+    log = new_log(rows, hyper.eval_points, device)
     step = _compiled(advance, compile)
     clock = torch.zeros((), dtype=torch.int64, device=device)
     done = 0
@@ -200,6 +200,4 @@ def train_students(
         steps = int(carry.steps[:wanted].sum())
         progress(steps - done)
         done = steps
-    return log.view(rows, hyper.eval_points, len(LOG_FIELDS))[:wanted].view(
-        len(worlds), len(pairs), hyper.eval_points, -1
-    )
+    return log[: wanted * hyper.eval_points * len(LOG_FIELDS)].view(len(worlds), len(pairs), hyper.eval_points, -1)
