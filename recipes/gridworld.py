@@ -41,8 +41,10 @@ from torchrl_priors.tabular import (
 
 log = logging.getLogger(__name__)
 
+#: Teachers trained together.
+_TEACHERS = 2048
 #: What the results do not depend on.
-_INCIDENTAL = ("out", "workers", "block_rows")
+_INCIDENTAL = ("out", "workers", "lanes", "block_worlds")
 
 
 def open_folder(cfg: GridworldConfig) -> RunFolder:
@@ -69,7 +71,7 @@ def teachers(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
         seeds = torch.arange(cfg.seed, cfg.seed + cfg.worlds, device=cfg.device)
         parts = []
         with tqdm(total=cfg.worlds * cfg.teacher.steps, unit="step", unit_scale=True, desc="teachers") as bar:
-            for chunk in seeds.split(cfg.block_rows):
+            for chunk in seeds.split(_TEACHERS):
                 worlds = world_sampler(cfg, chunk)
                 q, visited = train_teachers(
                     worlds, chunk, hyper, steps=cfg.teacher.steps, compile=cfg.compile, progress=bar.update
@@ -135,6 +137,7 @@ def _train(block: Block, progress: Callable[[int], Any]) -> np.ndarray:
         {count: sample_degraded(q, visited, seeds, count, cfg.teacher.temperature) for count in counts},
         runs_of(cfg.methods, cfg.priors),
         config,
+        lanes=cfg.lanes,
         compile=cfg.compile,
         progress=progress,
     )
@@ -147,7 +150,7 @@ def students(cfg: GridworldConfig, folder: RunFolder) -> np.ndarray:
     pairs = len(runs_of(cfg.methods, cfg.priors))
     # Blocks are equal in size, for a compiled step serves one shape: the last one is filled up with worlds of the one
     # before, whose results are the same there. Small studies are split too, so that every worker has a block.
-    count = max(-(-cfg.worlds * pairs // cfg.block_rows), min(workers, cfg.worlds))
+    count = max(-(-cfg.worlds // cfg.block_worlds), min(workers, cfg.worlds))
     size = -(-cfg.worlds // count)
     firsts = range(0, cfg.worlds, size)
     begins = [min(first, cfg.worlds - size) for first in firsts]

@@ -93,7 +93,8 @@ class GridworldConfig:
     device: str = MISSING
     workers: int | None = MISSING
     compile: bool = MISSING
-    block_rows: int = MISSING
+    lanes: int = MISSING
+    block_worlds: int = MISSING
     out: str | None = MISSING
 
 
@@ -125,7 +126,8 @@ def check(cfg: GridworldConfig) -> None:
         "evaluation.points": cfg.evaluation.points,
         "evaluation.interval": cfg.evaluation.interval,
         "bootstrap.reps": cfg.bootstrap.reps,
-        "block_rows": cfg.block_rows,
+        "lanes": cfg.lanes,
+        "block_worlds": cfg.block_worlds,
         "world.size": cfg.world.size,
         "teacher.temperature": cfg.teacher.temperature,
         "workers": 1 if cfg.workers is None else cfg.workers,

@@ -20,11 +20,23 @@ from torchrl_priors import functional as F
 from torchrl_priors.envs.gridworld import GridMaps, transition
 from torchrl_priors.random import uniform
 
-__all__ = ["ADVICE_WIDTH", "LOG_FIELDS", "Carry", "Hyper", "Runs", "advance", "initial_carry", "new_log", "new_records"]
+__all__ = [
+    "ADVICE_WIDTH",
+    "LOG_FIELDS",
+    "RECORD_WIDTH",
+    "Carry",
+    "Hyper",
+    "Runs",
+    "advance",
+    "initial_carry",
+    "new_log",
+    "new_records",
+]
 
 # The fields of a record; the four logits and their pending change come first.
 _LOGITS, _PENDING, _VALUE, _RAW_VALUE, _WEIGHT, _WEIGHT_PENDING, _EPISODE, _USED = 0, 4, 8, 9, 10, 11, 12, 13
-_WIDTH = 16
+#: Floats per state of a run's tables.
+RECORD_WIDTH = 16
 #: Floats per state of a table of advice.
 ADVICE_WIDTH = 8
 
@@ -113,11 +125,11 @@ class Carry(NamedTuple):
 
 def new_records(rows: int, states: int, device: torch.device | str | None = None) -> Tensor:
     """Tables of fresh runs, all zero: float32 ``[(rows * states + 1) * 16]``; the last record is a spare."""
-    return torch.zeros((rows * states + 1) * _WIDTH, device=device)
+    return torch.zeros((rows * states + 1) * RECORD_WIDTH, device=device)
 
 
 def new_log(rows: int, points: int, device: torch.device | str | None = None) -> Tensor:
-    """Room for the evaluation episodes of all runs: float32 ``[(rows * points + 1) * 8]``, the last entry is a spare."""
+    """Room for the evaluation episodes of all runs: float32 ``[(rows * points + 1) * 8]``; the last is a spare."""
     return torch.zeros((rows * points + 1) * len(LOG_FIELDS), device=device)
 
 
@@ -154,7 +166,7 @@ class _Visible(NamedTuple):
 
 
 def _read(records: Tensor, at: Tensor, episode: Tensor) -> _Visible:
-    first, four = at * _WIDTH, torch.arange(4, device=at.device).unsqueeze(1)
+    first, four = at * RECORD_WIDTH, torch.arange(4, device=at.device).unsqueeze(1)
     logits, pending = records[first + (four + _LOGITS)], records[first + (four + _PENDING)]
     weight, weight_pending = records[first + _WEIGHT], records[first + _WEIGHT_PENDING]
     fresh = records[first + _EPISODE] == episode
@@ -215,7 +227,7 @@ def advance(
     """Take one step in every run that is not finished, and learn from it; ``records`` and ``log`` change in place.
 
     Args:
-        clock (Tensor): int64 scalar, the number of this step; the random draws depend on it and on ``runs.key`` alone.
+        clock (Tensor): int64 ``[N]``, steps each run has made; its random draws depend on this and on its key alone.
         maps (GridMaps): the worlds.
         advice_table (Tensor): float32 ``[tables * C * 8]``: for each state of each table, log pi0 of the four actions,
             whether the state is degraded, and padding.
@@ -229,7 +241,7 @@ def advance(
         Carry: the same rows one step later.
     """
     rows = runs.key.shape[0]
-    states = (records.shape[0] // _WIDTH - 1) // rows
+    states = (records.shape[0] // RECORD_WIDTH - 1) // rows
     row = torch.arange(rows, device=clock.device)
     draw, slip, end, degrade = uniform(runs.key, clock)
     active = carry.points < hyper.eval_points
@@ -303,7 +315,7 @@ def advance(
     scalars = torch.stack([learned[1], learned[2], here.weight, learned[3], carry.episode])
     field = torch.arange(_USED, device=clock.device).unsqueeze(1)
     # Rows that are not training write to the spare record, which nobody reads.
-    at = torch.where(training, row * states + state, rows * states) * _WIDTH + field
+    at = torch.where(training, row * states + state, rows * states) * RECORD_WIDTH + field
     records.index_put_((at,), torch.cat([here.logits, learned[0], scalars]))
 
     degraded = carry.advice[4]

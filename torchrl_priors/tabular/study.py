@@ -13,7 +13,16 @@ from torchrl_priors.envs.gridworld import GridMaps
 from torchrl_priors.envs.worlds import GridWorlds
 from torchrl_priors.methods import get_method
 from torchrl_priors.random import derive_key
-from torchrl_priors.tabular.actor_critic import LOG_FIELDS, Hyper, Runs, advance, initial_carry, new_log, new_records
+from torchrl_priors.tabular.actor_critic import (
+    LOG_FIELDS,
+    RECORD_WIDTH,
+    Hyper,
+    Runs,
+    advance,
+    initial_carry,
+    new_log,
+    new_records,
+)
 from torchrl_priors.tabular.advice import advice_tables, parse_prior
 from torchrl_priors.tabular.q_learning import TeacherHyper, Teachers, q_step
 
@@ -21,7 +30,7 @@ __all__ = ["StudentConfig", "runs_of", "train_students", "train_teachers"]
 
 #: Rows come in multiples of this, so that no row is ever computed by the remainder loop of a vectorised kernel, whose
 #: last bits may differ: a run's result must not depend on its place in the batch.
-_LANES = 16
+_LANES = 64
 _CHECK = 256
 
 Progress = Callable[[int], Any]
@@ -151,6 +160,64 @@ def build_runs(
     return Runs(**{name: torch.stack(values, 1).flatten() for name, values in rows.items()})
 
 
+class _Lanes:
+    """The runs being stepped: as soon as one has finished, its lane is given to the next one that waits.
+
+    Args:
+        waiting (Runs): every run of the batch.
+        lanes (int): how many are stepped together.
+        maps, advice, hyper: as for :func:`~torchrl_priors.tabular.actor_critic.advance`.
+        states (int): rows of a run's tables.
+    """
+
+    def __init__(self, waiting: Runs, lanes: int, maps: GridMaps, advice: Tensor, hyper: Hyper, states: int) -> None:
+        device = waiting.key.device
+        self.waiting, self.maps, self.advice, self.hyper, self.lanes = waiting, maps, advice, hyper, lanes
+        self.runs = Runs(*(_pad(value[:lanes], lanes) for value in waiting))
+        self.carry = initial_carry(maps, advice, self.runs, hyper)
+        self.clock = torch.zeros(lanes, dtype=torch.int64, device=device)
+        self.records = new_records(lanes, states, device)
+        self.log = new_log(lanes, hyper.eval_points, device)
+        self.next = min(lanes, len(waiting.key))
+        #: the run in each lane; none (-1) in lanes that only fill up the batch
+        self.run = torch.where(torch.arange(lanes, device=device) < self.next, torch.arange(lanes, device=device), -1)
+        self.finished_steps = 0
+        self.results = torch.zeros(len(waiting.key), hyper.eval_points, len(LOG_FIELDS), device=device)
+
+    def step(self, advance: Callable) -> None:
+        """One step in every lane."""
+        self.carry = advance(
+            self.clock, self.maps, self.advice, self.runs, self.carry, self.records, self.log, self.hyper
+        )
+        self.clock = self.clock + 1
+
+    def training_steps(self) -> int:
+        """Training transitions made so far, in all runs."""
+        return self.finished_steps + int(torch.where(self.run >= 0, self.carry.steps, 0).sum())
+
+    def refill(self) -> bool:
+        """Keep what has finished and start what waits; whether anything is left to step."""
+        finished = ((self.carry.points >= self.hyper.eval_points) & (self.run >= 0)).nonzero().squeeze(-1)
+        if len(finished) == 0:
+            return True
+        log = self.log[: -len(LOG_FIELDS)].view(self.lanes, *self.results.shape[1:])
+        self.results[self.run[finished]] = log[finished]
+        self.finished_steps += int(self.carry.steps[finished].sum())
+        count = min(len(finished), len(self.waiting.key) - self.next)
+        lanes, new = finished[:count], torch.arange(self.next, self.next + count, device=finished.device)
+        self.next += count
+        self.run[finished] = -1
+        self.run[lanes] = new
+        arriving = Runs(*(value[new] for value in self.waiting))
+        for mine, theirs in zip(self.runs, arriving, strict=True):
+            mine[lanes] = theirs
+        for mine, theirs in zip(self.carry, initial_carry(self.maps, self.advice, arriving, self.hyper), strict=True):
+            mine[..., lanes] = theirs
+        self.clock[lanes] = 0
+        self.records[:-RECORD_WIDTH].view(self.lanes, -1)[lanes] = 0
+        return bool((self.run >= 0).any())
+
+
 @torch.no_grad()
 def train_students(
     worlds: GridWorlds,
@@ -160,6 +227,7 @@ def train_students(
     pairs: Sequence[tuple[str, str]],
     config: StudentConfig,
     *,
+    lanes: int = 1024,
     compile: bool = False,
     progress: Progress = lambda n: None,
 ) -> Tensor:
@@ -174,30 +242,23 @@ def train_students(
         config (StudentConfig): how they learn.
 
     Keyword Args:
+        lanes (int): runs stepped together.
         compile (bool): whether to compile the step.
         progress (callable): called with the number of training transitions made since the last call.
 
     Returns:
         Tensor: float32 ``[W, pairs, points, 8]``, see :data:`~torchrl_priors.tabular.actor_critic.LOG_FIELDS`.
     """
-    hyper, device = config.hyper, worlds.kind.device
-    maps = GridMaps.from_worlds(worlds)
     advice = advice_tables(q, degraded, config.temperature)
     runs = build_runs(worlds, seeds, pairs, degraded, config)
-    wanted = len(runs.key)
-    rows = -(-wanted // _LANES) * _LANES
-    runs = Runs(*(_pad(value, rows) for value in runs))
-    carry = initial_carry(maps, advice, runs, hyper)
-    records = new_records(rows, worlds.num_cells, device)
-    log = new_log(rows, hyper.eval_points, device)
+    lanes = -(-min(lanes, len(runs.key)) // _LANES) * _LANES
+    batch = _Lanes(runs, lanes, GridMaps.from_worlds(worlds), advice, config.hyper, worlds.num_cells)
     step = _compiled(advance, compile)
-    clock = torch.zeros((), dtype=torch.int64, device=device)
-    done = 0
-    while bool((carry.points < hyper.eval_points).any()):
+    left, steps = True, 0
+    while left:
         for _ in range(_CHECK):
-            carry = step(clock, maps, advice, runs, carry, records, log, hyper)
-            clock = clock + 1
-        steps = int(carry.steps[:wanted].sum())
-        progress(steps - done)
-        done = steps
-    return log[: wanted * hyper.eval_points * len(LOG_FIELDS)].view(len(worlds), len(pairs), hyper.eval_points, -1)
+            batch.step(step)
+        before, steps = steps, batch.training_steps()
+        progress(steps - before)
+        left = batch.refill()
+    return batch.results.view(len(worlds), len(pairs), *batch.results.shape[1:])
