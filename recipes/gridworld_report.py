@@ -190,7 +190,7 @@ def write(
         for name, table in tables.items()
         if len(table)
     ]
-    pictures = {"world": GridWorldEnv(worlds, window=cfg.world.window).render()}
+    pictures = {"world": GridWorldEnv(worlds[:1]).render()}
     if len(ratios):
         pictures |= figures(cfg, data, ratios, curves)
     for name, figure in pictures.items():

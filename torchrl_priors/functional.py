@@ -42,7 +42,8 @@ def categorical_cross_entropy(log_probs: Tensor, prior_log_probs: Tensor) -> Ten
         >>> round(categorical_cross_entropy(uniform, uniform).item(), 4)  # log 4
         1.3863
     """
-    return -(log_probs.exp() * prior_log_probs).sum(-1)
+    # What the student never does costs nothing, even where the prior rules it out too: 0 log 0 = 0.
+    return -(log_probs.exp() * prior_log_probs.masked_fill(log_probs == -torch.inf, 0.0)).sum(-1)
 
 
 def categorical_entropy(log_probs: Tensor) -> Tensor:

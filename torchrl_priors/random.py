@@ -79,8 +79,8 @@ def derive_key(seed: int | Tensor, *path: int | str | Tensor) -> Tensor:
 
     Args:
         seed (int or Tensor): the seed, int64.
-        path (int, str or Tensor): what tells this stream from others, e.g. a world's index and a method's name. Tensors
-            broadcast.
+        path (int, str or Tensor): what tells this stream from others, e.g. a world's index and a method's name. Numbers
+            are at least 0; tensors broadcast.
 
     Returns:
         Tensor: int64 keys of the broadcast shape.
@@ -93,8 +93,8 @@ def derive_key(seed: int | Tensor, *path: int | str | Tensor) -> Tensor:
     """
     key = torch.as_tensor(seed, dtype=torch.int64)
     for part in path:
-        # bit 32 tells a word from the number that its checksum is
-        number = zlib.crc32(part.encode()) + (1 << 32) if isinstance(part, str) else part
+        # A word is its checksum as a number below 0, so that it is never one of the numbers.
+        number = zlib.crc32(part.encode()) - (1 << 32) if isinstance(part, str) else part
         number = torch.as_tensor(number, dtype=torch.int64, device=key.device)
         w0, w1, _, _ = philox(key, (number & _MASK, (number >> 32) & _MASK))
         key = w0 | (w1 << 32)

@@ -90,14 +90,13 @@ class GridWorldEnv(EnvBase):
         worlds (GridWorlds): from :func:`~torchrl_priors.envs.worlds.sample_worlds`.
 
     Keyword Args:
-        window (int): side of the square that the agent sees, odd.
         noise (float): probability that the action is replaced.
         end_prob (float): probability that a step ends the episode.
         seed (int, optional): as in :meth:`set_seed`.
         device (device, optional): defaults to that of ``worlds``.
 
     Raises:
-        ValueError: probabilities outside [0, 1], or an even window.
+        ValueError: probabilities outside [0, 1].
 
     Examples:
         >>> from torchrl_priors.envs import sample_worlds
@@ -121,7 +120,6 @@ class GridWorldEnv(EnvBase):
         self,
         worlds: GridWorlds,
         *,
-        window: int = 9,
         noise: float = 0.1,
         end_prob: float = 0.01,
         seed: int | None = None,
@@ -130,8 +128,6 @@ class GridWorldEnv(EnvBase):
         for name, prob in (("noise", noise), ("end_prob", end_prob)):
             if not 0 <= prob <= 1:
                 raise ValueError(f"{name} must be a probability, got {prob}.")
-        if window < 1 or window % 2 == 0:
-            raise ValueError(f"window must be odd, got {window}.")
         device = torch.device(device) if device is not None else worlds.kind.device
         count = len(worlds)
         super().__init__(device=device, batch_size=[count])
@@ -139,14 +135,14 @@ class GridWorldEnv(EnvBase):
         self.noise, self.end_prob = noise, end_prob
         for name, table in GridMaps.from_worlds(self.worlds)._asdict().items():
             self.register_buffer(name, table)
-        self.register_buffer("view", windows(self.worlds.kind, window).flatten(0, 1))
+        self.register_buffer("view", windows(self.worlds.kind, worlds.window).flatten(0, 1))
         offset = torch.arange(count, device=device) * self.worlds.num_cells
         self.register_buffer("start", self.worlds.start + offset)
         self.register_buffer("key", torch.zeros(count, dtype=torch.int64, device=device))
         self.register_buffer("clock", torch.zeros((), dtype=torch.int64, device=device))
         cells = self.worlds.num_cells
         self.observation_spec = Composite(
-            observation=Bounded(0, len(KINDS) - 1, (count, window, window), device, torch.uint8),
+            observation=Bounded(0, len(KINDS) - 1, (count, worlds.window, worlds.window), device, torch.uint8),
             state=Categorical(cells, (count,), device, torch.int64),
             position=Categorical(count * cells, (count,), device, torch.int64),
             shape=(count,),

@@ -18,7 +18,7 @@ KINDS = (0.0, 0.0, 10.0, -10.0, 5.0, -5.0, 1.0, -1.0)
 _WALL = 1
 
 
-class GridWorlds(TensorClass):
+class GridWorlds(TensorClass["nocast"]):  # type: ignore[name-defined]
     """A batch of ``W`` worlds of ``C = size * size`` cells (numbered row by row), as look-up tables.
 
     Attributes:
@@ -28,6 +28,7 @@ class GridWorlds(TensorClass):
         terminal: bool ``[W, C]``, whether arriving ends the episode.
         state: int64 ``[W, C]``, the number of the observation: cells that look alike share that of the first of them.
         start: int64 ``[W]``, the cell where episodes begin.
+        window: side of the square that the agent sees.
     """
 
     kind: Tensor
@@ -36,6 +37,7 @@ class GridWorlds(TensorClass):
     terminal: Tensor
     state: Tensor
     start: Tensor
+    window: int
 
     @property
     def num_cells(self) -> int:
@@ -90,6 +92,7 @@ class GridWorlds(TensorClass):
             terminal=reward.abs() >= 5,
             state=_first_alike(windows(flat, window)),
             start=start,
+            window=window,
             batch_size=[worlds],
         )
 
