@@ -162,7 +162,8 @@ def students(cfg: GridworldConfig, folder: RunFolder) -> np.ndarray:
     budget = size * pairs * cfg.evaluation.points * cfg.evaluation.interval
     with tqdm(total=len(blocks) * budget, unit="step", unit_scale=True, desc="students") as bar:
         bar.update((len(blocks) - len(missing)) * budget)
-        run_all(train_block, missing, workers, bar.update)
+        # Runs end with an episode, a little after their budget.
+        run_all(train_block, missing, workers, lambda steps: bar.update(min(steps, bar.total - bar.n)))
         bar.update(bar.total - bar.n)
     kept = [folder.arrays(block.name)["episodes"] for block in blocks]
     return np.concatenate(
