@@ -22,40 +22,57 @@ STEPS, INTERVAL, POINTS = 300, 30, 5
 
 
 @cache
-def recorded(td_error: str) -> tuple[Study, list[Step], torch.Tensor, np.ndarray, np.ndarray]:
-    study = Study.small(runs_of(list(METHODS), PRIORS), td_error=td_error, eval_interval=INTERVAL, eval_points=POINTS)
+def recorded(td_error: str, end_prob: float = 0.06) -> tuple[Study, list[Step], torch.Tensor, np.ndarray, np.ndarray]:
+    study = Study.small(
+        runs_of(list(METHODS), PRIORS),
+        td_error=td_error,
+        eval_interval=INTERVAL,
+        eval_points=POINTS,
+        end_prob=end_prob,
+    )
     _, history, log, runs = play(study, STEPS)
     draws = torch.stack(uniform(runs.key.unsqueeze(1), torch.arange(STEPS)), -1).double().numpy()
     first = torch.stack(uniform(runs.key, 0, 1), -1).double().numpy()
     return study, history, log, draws, first
 
 
+def compare(method: str, prior: str, world: int, *how) -> None:
+    """A row of the recorded batch and its plain loop: what they did, logged and learned."""
+    study, history, log, draws, first = recorded(*how)
+    row = study.row((method, prior), world)
+    log = log[: -len(LOG_FIELDS)].view(-1, POINTS, len(LOG_FIELDS))[row]
+    end = max(index for index, step in enumerate(history) if step.done[row])  # the last whole episode
+    ties = [int(step.action[row]) for step in history]
+    plain = PlainStudent(study, method, prior, world, draws[row], first[row], ties)
+    learned = plain.run(end + 1)
+    steps = history[: len(plain.trace)]
+    assert [(int(step.state[row]), int(step.action[row])) for step in steps] == plain.trace
+    assert int(history[end].after.steps[row]) == learned
+    assert int(history[end].after.points[row]) == len(plain.log)
+    expected = torch.tensor([list(episode.values()) for episode in plain.log]).view(-1, len(LOG_FIELDS)).float()
+    torch.testing.assert_close(log[: len(plain.log)], expected, rtol=1e-4, atol=1e-4)
+    tables = read_tables(history[end].records, len(history[end].state))
+    for name, values in (
+        ("logits", plain.logits),
+        ("value", plain.value),
+        ("raw_value", plain.raw_value),
+        ("weight", plain.weight_logit),
+    ):
+        expected = torch.from_numpy(np.array([values[state] for state in range(study.states)])).float()
+        torch.testing.assert_close(getattr(tables, name)[row], expected, rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize("td_error", ["original", "shaped"])
 @pytest.mark.parametrize(("method", "prior"), runs_of(list(METHODS), PRIORS))
 def test_student_does_and_learns_what_a_plain_loop_does(method, prior, td_error):
-    study, history, log, draws, first = recorded(td_error)
-    log = log[: -len(LOG_FIELDS)].view(-1, study.config.hyper.eval_points, len(LOG_FIELDS))
-    for world in range(len(study.worlds)):
-        row = study.row((method, prior), world)
-        end = max(index for index, step in enumerate(history) if step.done[row])  # the last whole episode
-        ties = [int(step.action[row]) for step in history]
-        plain = PlainStudent(study, method, prior, world, draws[row], first[row], ties)
-        learned = plain.run(end + 1)
-        steps = history[: len(plain.trace)]
-        assert [(int(step.state[row]), int(step.action[row])) for step in steps] == plain.trace
-        assert int(history[end].after.steps[row]) == learned
-        assert int(history[end].after.points[row]) == len(plain.log)
-        expected = torch.tensor([list(episode.values()) for episode in plain.log]).view(-1, len(LOG_FIELDS)).float()
-        torch.testing.assert_close(log[row, : len(plain.log)], expected, rtol=1e-4, atol=1e-4)
-        tables = read_tables(history[end].records, len(history[end].state))
-        for name, values in (
-            ("logits", plain.logits),
-            ("value", plain.value),
-            ("raw_value", plain.raw_value),
-            ("weight", plain.weight_logit),
-        ):
-            expected = torch.from_numpy(np.array([values[state] for state in range(study.states)])).float()
-            torch.testing.assert_close(getattr(tables, name)[row], expected, rtol=1e-3, atol=1e-4)
+    for world in range(2):
+        compare(method, prior, world, td_error)
+
+
+@pytest.mark.parametrize("method", [method for method in METHODS if METHODS[method].auxiliary])
+@pytest.mark.parametrize("prior", PRIORS)
+def test_episode_that_begins_where_the_last_one_ended_sees_what_that_taught(method, prior):
+    compare(method, prior, 0, "original", 1.0)  # every episode is one step from the start
 
 
 def test_the_recorded_runs_saw_every_kind_of_event():
