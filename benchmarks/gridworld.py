@@ -5,7 +5,7 @@
 Trains the teachers and every student of ``study=paper`` in a few worlds, in one process, with the recipe's settings,
 and prints transitions per second. "Step" counts every transition of the lock-step batch (training and evaluation),
 "study" only those of the training budget, from the first step of the batch to its last: lanes that wait at the end
-count against it. Compilation is shown apart. The last line is what the whole study takes with one such process per core.
+count against it. Compilation is shown apart. The last line extrapolates to the whole study, one such process a core.
 """
 
 from __future__ import annotations
