@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recipes.runs import RunFolder, digest
+from recipes.workers import run_all
+
+CONFIG = {"worlds": 3, "student": {"lr": 0.1, "gamma": 0.95}, "methods": ["none", "er"]}
+NUMBERS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False])}
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def never() -> dict[str, np.ndarray]:
+    raise AssertionError("computed again")
+
+
+def test_digest_depends_on_every_value_and_not_on_the_order_of_keys():
+    shuffled = {"methods": ["none", "er"], "student": {"gamma": 0.95, "lr": 0.1}, "worlds": 3}
+    assert digest(shuffled) == digest(CONFIG)
+    others = [{**CONFIG, "worlds": 4}, {**CONFIG, "methods": ["er", "none"]}, {**CONFIG, "student": {"lr": 0.1}}]
+    assert len({digest(config) for config in [CONFIG, *others]}) == 4
+
+
+def test_folder_keeps_its_configuration_for_people_and_for_itself(tmp_path):
+    folder = RunFolder(tmp_path / "a" / "b", CONFIG, "worlds: 3\n")
+    assert (folder.path / "config.yaml").read_text() == "worlds: 3\n"
+    assert json.loads((folder.path / "config.json").read_text()) == CONFIG
+
+
+def test_same_configuration_finds_its_arrays_again(tmp_path):
+    RunFolder(tmp_path, CONFIG, "").arrays("blocks/0", lambda: NUMBERS)
+    folder = RunFolder(tmp_path, CONFIG, "")
+    assert folder.has("blocks/0")
+    assert not folder.has("blocks/1")
+    for again in (folder.arrays("blocks/0", never), folder.arrays("blocks/0")):
+        assert again.keys() == NUMBERS.keys()
+        assert all(np.array_equal(again[name], NUMBERS[name]) for name in NUMBERS)
+        assert again["b"].dtype == bool
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"worlds": 4}, "worlds: 3 -> 4"),
+        ({"student": {"lr": 0.2, "gamma": 0.95}}, r"student\.lr: 0\.1 -> 0\.2"),
+        ({"extra": 1}, "extra: absent -> 1"),
+        ({"methods": ["none"]}, "methods: .* -> "),
+    ],
+)
+def test_another_configuration_is_refused_by_what_differs_and_changes_nothing(tmp_path, change, message):
+    RunFolder(tmp_path, CONFIG, "old").arrays("blocks/0", lambda: NUMBERS)
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match=message) as error:
+        RunFolder(tmp_path, {**CONFIG, **change}, "new")
+    assert str(tmp_path) in str(error.value)
+    assert contents(tmp_path) == before
+
+
+def test_file_in_the_way_is_named_and_stays(tmp_path):
+    (tmp_path / "out").write_text("precious")
+    for path in (tmp_path / "out", tmp_path / "out" / "below"):
+        with pytest.raises(OSError, match="out="):
+            RunFolder(path, CONFIG, "")
+    assert (tmp_path / "out").read_text() == "precious"
+
+
+def test_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
+    folder = RunFolder(tmp_path, CONFIG, "")
+    folder.write("table.csv", lambda path: path.write_text("old"))
+    before = contents(tmp_path)
+
+    def fail(path: Path) -> None:
+        path.write_text("half of the ne")
+        raise RuntimeError("out of luck")
+
+    with pytest.raises(RuntimeError, match="out of luck"):
+        folder.write("table.csv", fail)
+    assert contents(tmp_path) == before
+
+
+def test_computation_that_fails_leaves_nothing_behind(tmp_path):
+    folder = RunFolder(tmp_path, CONFIG, "")
+    with pytest.raises(AssertionError):
+        folder.arrays("blocks/0", never)
+    assert not folder.has("blocks/0")
+
+
+@pytest.mark.parametrize("damage", [b"", b"no archive", "half", "flipped"])
+def test_damaged_arrays_are_named_and_kept(tmp_path, damage):
+    folder = RunFolder(tmp_path, CONFIG, "")
+    folder.arrays("blocks/0", lambda: NUMBERS)
+    file = tmp_path / "blocks" / "0.npz"
+    whole = file.read_bytes()
+    if damage == "half":
+        damage = whole[: len(whole) // 2]
+    elif damage == "flipped":
+        at = whole.index(NUMBERS["a"].tobytes()) + 20
+        damage = whole[:at] + bytes([whole[at] ^ 255]) + whole[at + 1 :]
+    file.write_bytes(damage)
+    with pytest.raises(ValueError, match=r"0\.npz is damaged .*: delete it"):
+        folder.arrays("blocks/0", never)
+    assert file.read_bytes() == damage
+
+
+def test_arrays_that_were_not_computed_are_missing_not_made_up(tmp_path):
+    with pytest.raises((ValueError, OSError), match="blocks/7"):
+        RunFolder(tmp_path, CONFIG, "").arrays("blocks/7")
+
+
+def square(job: int, report) -> None:
+    """A job of the tests below: it leaves its result in a file, as the recipes' do."""
+    path, number = job
+    if number < 0:
+        raise ValueError(f"job {number} is broken")
+    report(number)
+    (path / str(number)).write_text(f"{number**2} {os.getpid()}")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_every_job_is_done_once(tmp_path, workers):
+    counted: list[int] = []
+    run_all(square, [(tmp_path, number) for number in range(1, 5)], workers, counted.append)
+    results = [(tmp_path / str(number)).read_text().split() for number in range(1, 5)]
+    assert [int(result[0]) for result in results] == [1, 4, 9, 16]
+    assert len(set(counted)) == len(counted)
+    assert set(counted) <= {1, 2, 3, 4}  # a process may end before its last word has arrived
+    assert workers > 1 or len(counted) == 4
+    assert {int(result[1]) for result in results}.isdisjoint({os.getpid()}) == (workers > 1)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_error_of_a_job_reaches_the_caller(tmp_path, workers):
+    with pytest.raises(ValueError, match="job -3 is broken"):
+        run_all(square, [(tmp_path, 1), (tmp_path, -3)], workers, lambda amount: None)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    (tmp_path / "endless.py").write_text(
+        textwrap.dedent("""
+            import os, sys, time
+            from pathlib import Path
+            from recipes.workers import run_all
+
+            def wait(job, report):
+                Path(sys.argv[1] if len(sys.argv) > 1 else job, str(os.getpid())).touch()
+                time.sleep(600)
+
+            if __name__ == "__main__":
+                run_all(wait, [sys.argv[1]] * 2, 2, print)
+        """)
+    )
+    (tmp_path / "pids").mkdir()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path.cwd()), str(tmp_path)])}
+    command = [sys.executable, str(tmp_path / "endless.py"), str(tmp_path / "pids")]
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) as parent:
+        deadline = time.monotonic() + 120
+        while len(pids := [int(file.name) for file in (tmp_path / "pids").iterdir()]) < 2:
+            assert parent.poll() is None, parent.stderr.read().decode()
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        parent.send_signal(signal.SIGKILL)
+    while any(alive(pid) for pid in pids):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
