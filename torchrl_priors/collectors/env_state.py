@@ -1,0 +1,188 @@
+"""The exact state of vectors of MuJoCo environments."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    import gymnasium
+    import mujoco
+    from gymnasium.vector import VectorEnv
+
+__all__ = ["env_state_dict", "load_env_state_dict"]
+
+
+def env_state_dict(env: VectorEnv) -> dict[str, Any]:
+    """The state of each environment of a vector, exact to the bit.
+
+    Of each environment:
+
+    * the simulator's integration state, warm start included (``mjSTATE_INTEGRATION``), and the quantities that the last
+      step derived from the state before it: some environments read these first in the next step (Ant, Humanoid);
+    * the state of its random numbers;
+    * the numbers and arrays among the attributes of the environment and its wrappers (elapsed steps, ...).
+
+    Args:
+        env (VectorEnv): a :class:`gymnasium.vector.SyncVectorEnv` of MuJoCo environments, between steps, with no
+            episode that ended and was not reset.
+
+    Returns:
+        dict: ``"physics"``, a float64 tensor ``[num_envs, numbers]``, and ``"attributes"``, a list of JSON texts.
+
+    Raises:
+        TypeError: an environment that is none of MuJoCo's, or a wrapper that keeps something else than numbers and
+            arrays; named in the message.
+    """
+    envs = _sub_envs(env)
+    return {
+        "physics": torch.from_numpy(np.stack([_physics(sub) for sub in envs])),
+        "attributes": [json.dumps(_attributes(sub)) for sub in envs],
+    }
+
+
+def load_env_state_dict(env: VectorEnv, state_dict: Mapping[str, Any]) -> None:
+    """Puts the environments of a vector into the states that :func:`env_state_dict` returned.
+
+    Raises:
+        TypeError: see :func:`env_state_dict`.
+        ValueError: the state is that of another number or kind of environments.
+    """
+    envs = _sub_envs(env)
+    physics, attributes = state_dict["physics"].cpu().numpy(), [json.loads(text) for text in state_dict["attributes"]]
+    if len(attributes) != len(envs):
+        raise ValueError(f"The state is that of {len(attributes)} environments, there are {len(envs)}.")
+    for sub, saved, numbers in zip(envs, attributes, physics, strict=True):
+        for what, value in _identity(sub).items():
+            if saved["identity"].get(what) != value:
+                raise ValueError(
+                    f"The state is that of another environment: {what} {saved['identity'].get(what)}, not {value}."
+                )
+        if numbers.shape != _physics(sub).shape:
+            raise ValueError("The state is that of another model, or of another version of MuJoCo.")
+    env.reset()  # the vector's and the wrappers' own bookkeeping, as of environments within an episode
+    for sub, saved, numbers in zip(envs, attributes, physics, strict=True):
+        _set_attributes(sub, saved)
+        _set_physics(sub, numbers)
+
+
+def _sub_envs(env: VectorEnv) -> list[gymnasium.Env]:
+    """The environments of a vector, all of them MuJoCo's."""
+    from gymnasium.vector import SyncVectorEnv
+
+    if not isinstance(env, SyncVectorEnv):
+        raise TypeError(
+            f"Only the state of a SyncVectorEnv can be saved, not that of {type(env).__name__}: see make_vector_env."
+        )
+    for sub in env.envs:
+        base = sub.unwrapped
+        kinds = (type(getattr(base, "model", None)).__name__, type(getattr(base, "data", None)).__name__)
+        if kinds != ("MjModel", "MjData"):
+            name = type(base).__name__ if base.spec is None else base.spec.id
+            raise TypeError(f"{name} is not a MuJoCo environment: its state cannot be saved.")
+    return list(env.envs)
+
+
+def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
+    """The wrappers of an environment, from the outside, and the environment itself."""
+    while env is not env.unwrapped:
+        yield env
+        env = env.env
+    yield env
+
+
+def _identity(env: gymnasium.Env) -> dict[str, Any]:
+    spec = env.unwrapped.spec
+    return {
+        "id": None if spec is None else spec.id,
+        "arguments": None if spec is None else repr(sorted(spec.kwargs.items())),
+        "layers": [type(layer).__name__ for layer in _layers(env)],
+    }
+
+
+def _attributes(env: gymnasium.Env) -> dict[str, Any]:
+    """Identity, random numbers and numeric attributes."""
+    return {
+        "identity": _identity(env),
+        "random": env.unwrapped.np_random.bit_generator.state,
+        "layers": [
+            {name: _encode(value) for name, value in vars(layer).items() if _is_state(layer, name, value)}
+            for layer in _layers(env)
+        ],
+    }
+
+
+def _set_attributes(env: gymnasium.Env, saved: Mapping[str, Any]) -> None:
+    env.unwrapped.np_random.bit_generator.state = saved["random"]
+    for layer, values in zip(_layers(env), saved["layers"], strict=True):
+        for name, value in values.items():
+            setattr(layer, name, _decode(value))
+
+
+def _is_state(layer: gymnasium.Env, name: str, value: Any) -> bool:
+    """Whether an attribute is to be saved; raises if it may hold a state that cannot be."""
+    if isinstance(value, (bool, int, float, np.generic, np.ndarray)):
+        return True
+    known = (str, tuple, dict, type(None), np.random.Generator)  # descriptions, and what is saved by itself
+    # spaces, specifications, renderers, the inner environment; models and data
+    known_modules = ("gymnasium.spaces.", "gymnasium.envs.", "mujoco.")
+    if isinstance(value, known) or callable(value) or name == "env":
+        return False
+    if type(value).__module__.startswith(known_modules):
+        return False
+    raise TypeError(f"{type(layer).__name__} keeps {name!r}, a {type(value).__name__}: its state cannot be saved.")
+
+
+def _encode(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return {"dtype": value.dtype.str, "array": isinstance(value, np.ndarray), "value": value.tolist()}
+    return value
+
+
+def _decode(value: Any) -> Any:
+    if isinstance(value, dict):
+        array = np.array(value["value"], dtype=value["dtype"])
+        return array if value["array"] else array[()]
+    return value
+
+
+def _derived_fields(model: mujoco.MjModel) -> list[str]:
+    """The arrays of MjData of real numbers whose size does not change: not those of contacts and constraints."""
+    import mujoco
+
+    pristine = mujoco.MjData(model)
+    arrays = {name: getattr(pristine, name) for name in dir(pristine) if not name.startswith("_")}
+    return [
+        name
+        for name, value in arrays.items()
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.size
+    ]
+
+
+def _physics(env: gymnasium.Env) -> np.ndarray:
+    import mujoco
+
+    model, data = env.unwrapped.model, env.unwrapped.data
+    signature = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    state = np.empty(mujoco.mj_stateSize(model, signature))
+    mujoco.mj_getState(model, data, state, signature)
+    return np.concatenate([state, *(getattr(data, name).ravel() for name in _derived_fields(model))])
+
+
+def _set_physics(env: gymnasium.Env, numbers: np.ndarray) -> None:
+    import mujoco
+
+    model, data = env.unwrapped.model, env.unwrapped.data
+    signature = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    size = mujoco.mj_stateSize(model, signature)
+    mujoco.mj_resetData(model, data)
+    mujoco.mj_setState(model, data, numbers[:size], signature)
+    position = size
+    for name in _derived_fields(model):
+        array = getattr(data, name)
+        array[...] = numbers[position : position + array.size].reshape(array.shape)
+        position += array.size

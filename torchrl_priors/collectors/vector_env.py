@@ -1,0 +1,105 @@
+"""Vectors of Gymnasium environments, as the collector needs them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from gymnasium.vector import SyncVectorEnv, VectorEnv
+
+__all__ = ["check_vector_env", "make_vector_env", "spread_seed"]
+
+
+def make_vector_env(env_id: str, num_envs: int, **kwargs: Any) -> SyncVectorEnv:
+    """A :class:`gymnasium.vector.SyncVectorEnv` that does not reset by itself: its last observations are the true ones.
+
+    The models of some environments use features that MuJoCo deprecates. These notices, which MuJoCo would print and
+    append to a file in the working directory, are dropped while the environments are built; its other warnings become
+    Python warnings. Warnings of the running simulation are left alone.
+
+    Args:
+        env_id (str): a registered environment, e.g. ``"HalfCheetah-v5"``.
+        num_envs (int): number of environments.
+        kwargs: see :func:`gymnasium.make`.
+
+    Raises:
+        ImportError: if Gymnasium is not installed.
+        ValueError: if ``num_envs`` is below 1.
+    """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
+    try:
+        import gymnasium
+        from gymnasium.vector import AutoresetMode, SyncVectorEnv
+    except ImportError as error:
+        raise ImportError(
+            "make_vector_env needs Gymnasium: install the extra 'mujoco' (pip install 'torchrl-priors[mujoco]')."
+        ) from error
+    with _quiet_mujoco():
+        return SyncVectorEnv(
+            [lambda: gymnasium.make(env_id, **kwargs)] * num_envs, autoreset_mode=AutoresetMode.DISABLED
+        )
+
+
+@contextmanager
+def _quiet_mujoco() -> Iterator[None]:
+    """Keeps MuJoCo's deprecation notices from the console and from MUJOCO_LOG.TXT."""
+    try:
+        import mujoco
+    except ImportError:
+        yield
+        return
+    messages: list[str] = []
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(messages.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+        for message in messages:
+            if "deprecated" not in message:
+                warnings.warn(f"MuJoCo: {message.strip()}", stacklevel=4)
+
+
+def check_vector_env(env: VectorEnv) -> None:
+    """Raises if the collector cannot run an environment.
+
+    Raises:
+        ValueError: if it resets by itself.
+        TypeError: if its observations or actions are not arrays of real numbers.
+    """
+    mode = env.metadata.get("autoreset_mode")
+    if getattr(mode, "name", mode) != "DISABLED":
+        raise ValueError(
+            f"The environment's autoreset mode is {mode}, which hides last observations: build it with make_vector_env,"
+            " or with autoreset_mode=AutoresetMode.DISABLED."
+        )
+    for name, space in (("observation", env.single_observation_space), ("action", env.single_action_space)):
+        if type(space).__name__ != "Box" or not np.issubdtype(space.dtype, np.floating):
+            raise TypeError(f"The environment's {name} space must be a Box of real numbers, got {space}.")
+
+
+def spread_seed(seed: int | None, num_envs: int, stream: int) -> tuple[list[int], int]:
+    """Independent seeds of the sub-environments and of the actions, from one.
+
+    Gymnasium's own rule, seed + i, gives sub-environment 1 of seed 0 the numbers of sub-environment 0 of seed 1.
+
+    Args:
+        seed (int or None): at least 0; None draws one from the operating system.
+        num_envs (int): number of sub-environments.
+        stream (int): another stream gives other seeds.
+
+    Examples:
+        >>> spread_seed(0, 2, stream=0) == spread_seed(0, 2, stream=0)
+        True
+        >>> spread_seed(0, 2, stream=0) == spread_seed(0, 2, stream=1)
+        False
+    """
+    words = np.random.SeedSequence(seed, spawn_key=(stream,)).generate_state(num_envs + 1)
+    *environments, actions = (int(word) for word in words)
+    return environments, actions
