@@ -1,6 +1,6 @@
 """Speed of the tabular study, by phase.
 
-    python benchmarks/gridworld.py [--worlds 72] [--device cpu] [--eager]
+    python benchmarks/gridworld.py [--worlds 125] [--device cpu] [--eager]
 
 Trains the teachers and every student of ``study=paper`` in a few worlds, in one process, with the recipe's settings,
 and prints transitions per second. "Step" counts every transition of the lock-step batch (training and evaluation),
@@ -58,7 +58,7 @@ def students(
 def main() -> None:
     """Run every phase and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--worlds", type=int, default=72)
+    parser.add_argument("--worlds", type=int, default=125)
     parser.add_argument("--lanes", type=int, default=1024)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--eager", action="store_true", help="without torch.compile")
