@@ -1,0 +1,260 @@
+"""The format of a policy file: safetensors whose metadata holds a version, a manifest and the digest of the file."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import os
+import re
+import secrets
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_priors.networks import ACTIVATIONS
+
+__all__ = [
+    "STATISTICS",
+    "ArtifactError",
+    "PolicyManifest",
+    "check_tensors",
+    "pack",
+    "parse_manifest",
+    "read",
+    "read_manifest",
+    "write_atomically",
+]
+
+_FORMAT = "torchrl_priors.policy"
+_VERSION = 1
+_ARCHITECTURE = "gaussian_mlp"
+_MAX_HEADER = 1 << 20  # bytes: a policy's header has a few thousand, another model's may have many
+_NO_DIGEST = "0" * 64
+STATISTICS = ("mean", "var", "count")
+"""The buffers of a :class:`~torchrl_priors.collectors.RunningNorm`; a file has them after ``normalizer.``."""
+
+
+class ArtifactError(ValueError):
+    """A file is not the policy that was asked for: damaged, foreign, too new, or for another environment."""
+
+
+@dataclass(frozen=True)
+class PolicyManifest:
+    """What a policy file says of its policy.
+
+    Args:
+        env_id (str): the environment that the policy was trained on, e.g. ``"HalfCheetah-v5"``.
+        obs_dim (int): features of a raw observation.
+        act_dim (int): dimensions of an action.
+        hidden (tuple of int): cells of each hidden layer.
+        activation (str): one of :data:`~torchrl_priors.networks.ACTIVATIONS`.
+        architecture (str): the kind of network, ``"gaussian_mlp"`` (:class:`~torchrl_priors.networks.GaussianMLP`).
+        normalizer (dict, optional): ``eps`` and ``clip`` of the :class:`~torchrl_priors.collectors.RunningNorm` whose
+            statistics the file has; ``None`` if the policy reads raw observations.
+        seed (int, optional): of the training.
+        frames (int, optional): environment steps of the training.
+        evaluation (dict): how good it is, e.g. ``{"mean_return": 1828.0, "episodes": 50}``.
+        training (dict): how it was trained, e.g. the configuration of the run.
+    """
+
+    env_id: str
+    obs_dim: int
+    act_dim: int
+    hidden: tuple[int, ...]
+    activation: str
+    architecture: str = _ARCHITECTURE
+    normalizer: dict[str, float] | None = None
+    seed: int | None = None
+    frames: int | None = None
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)
+
+
+def read_manifest(path: str | os.PathLike[str]) -> PolicyManifest:
+    """Reads what a policy file says of its policy, and checks the file as :func:`load_policy` does.
+
+    Args:
+        path (str or path): the file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ArtifactError: as :func:`load_policy`.
+        ImportError: safetensors is not installed.
+    """
+    return read(Path(path))[1]
+
+
+def _safetensors() -> ModuleType:
+    try:
+        import safetensors.torch
+    except ImportError as error:
+        raise ImportError("Policy files need safetensors: pip install 'torchrl-priors[mujoco]'.") from error
+    return safetensors
+
+
+def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _VERSION) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        ValueError: the manifest is too long to be read again.
+    """
+    # the digest comes first, so that no zeros of the manifest are taken for its place
+    about = json.dumps({"sha256": _NO_DIGEST, "version": version, "manifest": manifest}, allow_nan=False)
+    data = _seal(_safetensors().torch.save(tensors, metadata={_FORMAT: about}))
+    if int.from_bytes(data[:8], "little") > _MAX_HEADER:
+        raise ValueError(f"This policy can't be saved: its manifest is longer than {_MAX_HEADER} bytes.")
+    return data
+
+
+def _seal(data: bytes) -> bytes:
+    """Puts the digest of the file, in which the digest's own place is zeros, into that place."""
+    return data.replace(_NO_DIGEST.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Writes a file that appears under its name when it is complete, or not at all.
+
+    Raises:
+        FileNotFoundError: its folder does not exist.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"No folder {path.parent} to save a policy in.")
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with partial.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read(path: Path) -> tuple[dict[str, Tensor], PolicyManifest]:
+    """The tensors and the manifest of a file, after every check."""
+    _safetensors()
+    if not path.is_file():
+        raise FileNotFoundError(f"No policy file at {path}.")
+    try:
+        data, about = _read_bytes(path)
+        version = about.get("version")
+        if type(version) is not int or version != _VERSION:
+            raise ArtifactError(
+                f"it is of version {version!r}, and this release reads version {_VERSION}: it may need a"
+                " newer torchrl_priors"
+            )
+        digest = about.get("sha256")
+        if not isinstance(digest, str) or not re.fullmatch(r"[0-9a-f]{64}", digest):
+            raise ArtifactError("it is damaged: it has no digest")
+        if _seal(data.replace(digest.encode(), _NO_DIGEST.encode(), 1)) != data:
+            raise ArtifactError("it is damaged: its content does not match its digest")
+        manifest = parse_manifest(about.get("manifest"))
+        tensors = {name: value.clone() for name, value in _load(data).items()}
+        check_tensors(tensors, manifest)
+    except ArtifactError as error:
+        raise ArtifactError(f"{path} can't be used as a policy: {error}.") from error
+    return tensors, manifest
+
+
+def _load(data: bytes) -> dict[str, Tensor]:
+    safetensors = _safetensors()
+    try:
+        return safetensors.torch.load(data)
+    except (safetensors.SafetensorError, KeyError, RuntimeError, ValueError) as error:  # e.g. a type torch lacks
+        raise ArtifactError(f"its tensors can't be read: {error!r}") from error
+
+
+def _read_bytes(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """A file of this format and its metadata; another's tensors, which may be gigabytes, are not read."""
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+        if size > _MAX_HEADER:
+            raise ArtifactError("it is not a safetensors file with one policy")
+        header = file.read(size)
+        try:
+            if len(header) < size:
+                raise ValueError
+            metadata = json.loads(header)["__metadata__"]
+        except (ValueError, TypeError, KeyError, RecursionError):  # JSON and UTF-8 errors are ValueErrors
+            raise ArtifactError("it is truncated, or not a safetensors file with metadata") from None
+        try:
+            about = json.loads(metadata[_FORMAT], parse_constant=_refuse_constant)
+        except (TypeError, KeyError):
+            raise ArtifactError("it is a safetensors file, but not one of torchrl_priors.save_policy") from None
+        except (ValueError, RecursionError):
+            raise ArtifactError("it is damaged: its manifest is not JSON") from None
+        if not isinstance(about, dict):
+            raise ArtifactError("it is damaged: its manifest is not an object")
+        file.seek(0)
+        return file.read(), about
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def parse_manifest(values: Any) -> PolicyManifest:
+    """A manifest from JSON, checked entry by entry."""
+    names = {item.name for item in fields(PolicyManifest)}
+    if not isinstance(values, dict) or values.keys() != names:
+        raise ArtifactError(f"its manifest must have the entries {', '.join(sorted(names))}")
+    if values["architecture"] != _ARCHITECTURE:
+        raise ArtifactError(f"its architecture is unknown: {values['architecture']!r}, expected {_ARCHITECTURE!r}")
+    if not isinstance(values["activation"], str) or values["activation"] not in ACTIVATIONS:
+        raise ArtifactError(f"its activation is unknown: {values['activation']!r}")
+    if not isinstance(values["env_id"], str) or not values["env_id"]:
+        raise ArtifactError(f"it must name its environment, got env_id={values['env_id']!r}")
+    normalizer = values["normalizer"]
+    if normalizer is not None and (
+        not isinstance(normalizer, dict)
+        or normalizer.keys() != {"eps", "clip"}
+        or not all(type(value) in (int, float) and 0 < value < math.inf for value in normalizer.values())
+    ):
+        raise ArtifactError(f"its normalizer must be null or have a positive eps and clip, got {normalizer!r}")
+    hidden = values["hidden"]
+    if not isinstance(hidden, list) or not all(_is_count(size, 1) for size in hidden):
+        raise ArtifactError(f"its hidden layers must have positive sizes, got {hidden!r}")
+    for name in ("obs_dim", "act_dim"):
+        if not _is_count(values[name], 1):
+            raise ArtifactError(f"its {name} must be a positive integer, got {values[name]!r}")
+    for name in ("seed", "frames"):
+        if values[name] is not None and not _is_count(values[name], 0):
+            raise ArtifactError(f"its {name} must be an integer of at least 0, got {values[name]!r}")
+    for name in ("evaluation", "training"):
+        if not isinstance(values[name], dict):
+            raise ArtifactError(f"its {name} must be an object of JSON, got {values[name]!r}")
+    return PolicyManifest(**{**values, "hidden": tuple(hidden)})
+
+
+def _is_count(value: Any, least: int) -> bool:
+    return type(value) is int and value >= least
+
+
+def check_tensors(tensors: dict[str, Tensor], manifest: PolicyManifest) -> None:
+    """Holds names, shapes, types and values against the manifest, before any memory is given to a network."""
+    sizes = [manifest.obs_dim, *manifest.hidden, manifest.act_dim]
+    expected: dict[str, tuple[tuple[int, ...], torch.dtype]] = {}
+    for layer, (inputs, outputs) in enumerate(itertools.pairwise(sizes)):
+        expected[f"actor.mean.{2 * layer}.weight"] = (outputs, inputs), torch.float32
+        expected[f"actor.mean.{2 * layer}.bias"] = (outputs,), torch.float32
+    expected["actor.scale.state_independent_scale"] = (manifest.act_dim,), torch.float32
+    if manifest.normalizer is not None:
+        for name in STATISTICS:
+            expected[f"normalizer.{name}"] = () if name == "count" else (manifest.obs_dim,), torch.float64
+    if tensors.keys() != expected.keys():
+        differing = sorted(tensors.keys() ^ expected.keys())
+        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {', '.join(differing)}")
+    for name, (shape, dtype) in expected.items():
+        value = tensors[name]
+        if tuple(value.shape) != shape or value.dtype is not dtype:
+            raise ArtifactError(f"{name} must be {dtype} of shape {shape}, got {value.dtype} of {tuple(value.shape)}")
+        if not value.isfinite().all():
+            raise ArtifactError(f"{name} is not finite: it has NaN or infinite entries")
+    if manifest.normalizer is not None and ((tensors["normalizer.var"] < 0).any() or tensors["normalizer.count"] < 0):
+        raise ArtifactError("the statistics of its observations have a negative variance or count")
