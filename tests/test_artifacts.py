@@ -176,6 +176,12 @@ class TestRoundTrip:
         load_prior(saved.path)
         assert torch.equal(torch.get_rng_state(), before)
 
+    def test_parameters_may_be_views_of_one_buffer(self, saved: Saved) -> None:
+        flat = torch.nn.utils.parameters_to_vector(saved.actor.parameters()).detach().clone()
+        torch.nn.utils.vector_to_parameters(flat, saved.actor.parameters())
+        save_policy(saved.path.with_name("again"), saved.actor, saved.normalizer, env_id="Hopper-v5")
+        assert saved.path.with_name("again").read_bytes() == saved.path.read_bytes()
+
     def test_manifest_may_hold_what_looks_like_an_empty_digest(self, tmp_path: Path) -> None:
         save_policy(tmp_path / "policy", *trained(), env_id="0" * 64, training={"0" * 64: "0" * 640})
         assert read_manifest(tmp_path / "policy").env_id == "0" * 64

@@ -88,7 +88,7 @@ def save_policy(
         if not isinstance(normalizer, RunningNorm):
             raise TypeError(f"The statistics of a policy are those of a RunningNorm, got {type(normalizer).__name__}.")
         tensors |= {f"normalizer.{name}": getattr(normalizer, name) for name in STATISTICS}
-    tensors = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     manifest = PolicyManifest(
         env_id=env_id,
         obs_dim=net.obs_dim,
