@@ -7,7 +7,6 @@ An interrupted run continues where it was; a finished one only reports again. Se
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Callable
@@ -38,8 +37,6 @@ from torchrl_priors.tabular import (
     train_students,
     train_teachers,
 )
-
-log = logging.getLogger(__name__)
 
 #: Teachers trained together.
 _TEACHERS = 2048
@@ -182,8 +179,7 @@ def main(cfg: GridworldConfig) -> None:
         episodes = students(cfg, folder)
         gridworld_report.write(cfg, folder, world_sampler(cfg, torch.from_numpy(taught["seed"])), taught, episodes)
     except (ValueError, OSError) as error:
-        log.error("%s", error)
-        sys.exit(2)
+        sys.exit(f"Error: {error}")
 
 
 if __name__ == "__main__":

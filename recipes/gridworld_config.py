@@ -116,7 +116,10 @@ def check(cfg: GridworldConfig) -> None:
         _require(len(names) > 0, key, list(names), "at least one")
         _require(len(set(names)) == len(names), key, list(names), "no name twice")
         for name in names:
-            parse(name)
+            try:
+                parse(name)
+            except ValueError as error:
+                raise ValueError(f"{key}={list(names)}: {error}") from None
     _require("none" in cfg.methods, "methods", list(cfg.methods), "none among them: area ratios compare with it")
     _require(cfg.td_error in ("original", "shaped"), "td_error", cfg.td_error, "original or shaped")
     positive = {
@@ -133,7 +136,7 @@ def check(cfg: GridworldConfig) -> None:
         "workers": 1 if cfg.workers is None else cfg.workers,
     }
     for key, value in positive.items():
-        _require(value > 0, key, value, "a positive number")
+        _require(0 < value < float("inf"), key, value, "a positive number")
     _require(cfg.world.window > 0 and cfg.world.window % 2 == 1, "world.window", cfg.world.window, "an odd number")
     probabilities = {f"world.{name}": cfg.world[name] for name in ("wall_prob", "object_prob", "noise")}  # type: ignore[index]
     probabilities |= {"teacher.epsilon": cfg.teacher.epsilon, "teacher.gamma": cfg.teacher.gamma}
@@ -151,7 +154,7 @@ def check(cfg: GridworldConfig) -> None:
     rates |= {"student.bonus_coeff": cfg.student.bonus_coeff, "student.aux_coeff": cfg.student.aux_coeff}
     for key, value in rates.items():
         _require(0 <= value < float("inf"), key, value, "a number of at least 0")
-    _require(cfg.seed >= 0, "seed", cfg.seed, "a number of at least 0")
+    _require(0 <= cfg.seed < 2**62, "seed", cfg.seed, "a number in [0, 2**62)")
     try:
         torch.zeros(1, device=cfg.device)
     except (RuntimeError, AssertionError) as error:
