@@ -96,10 +96,11 @@ def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
 
 
 def _identity(env: gymnasium.Env) -> dict[str, Any]:
-    spec = env.unwrapped.spec
+    spec = env.spec
     return {
         "id": None if spec is None else spec.id,
         "arguments": None if spec is None else repr(sorted(spec.kwargs.items())),
+        "max_episode_steps": None if spec is None else spec.max_episode_steps,
         "layers": [type(layer).__name__ for layer in _layers(env)],
     }
 
@@ -109,10 +110,7 @@ def _attributes(env: gymnasium.Env) -> dict[str, Any]:
     return {
         "identity": _identity(env),
         "random": env.unwrapped.np_random.bit_generator.state,
-        "layers": [
-            {name: _encode(value) for name, value in vars(layer).items() if _is_state(layer, name, value)}
-            for layer in _layers(env)
-        ],
+        "layers": [_numbers(layer) for layer in _layers(env)],
     }
 
 
@@ -123,16 +121,21 @@ def _set_attributes(env: gymnasium.Env, saved: Mapping[str, Any]) -> None:
             setattr(layer, name, _decode(value))
 
 
+def _numbers(layer: gymnasium.Env) -> dict[str, Any]:
+    if type(layer).__name__ == "PassiveEnvChecker":  # remembers what it has checked, and changes nothing
+        return {}
+    return {name: _encode(value) for name, value in vars(layer).items() if _is_state(layer, name, value)}
+
+
 def _is_state(layer: gymnasium.Env, name: str, value: Any) -> bool:
     """Whether an attribute is to be saved; raises if it may hold a state that cannot be."""
     if isinstance(value, (bool, int, float, np.generic, np.ndarray)):
         return True
-    known = (str, tuple, dict, type(None), np.random.Generator)  # descriptions, and what is saved by itself
-    # spaces, specifications, renderers, the inner environment; models and data
-    known_modules = ("gymnasium.spaces.", "gymnasium.envs.", "mujoco.")
-    if isinstance(value, known) or callable(value) or name == "env":
+    # descriptions, the inner environment, and what is saved on its own
+    if isinstance(value, (str, tuple, dict, type(None), np.random.Generator)) or callable(value) or name == "env":
         return False
-    if type(value).__module__.startswith(known_modules):
+    # spaces, specifications and renderers; models and their data
+    if type(value).__module__.startswith(("gymnasium.spaces.", "gymnasium.envs.", "mujoco.")):
         return False
     raise TypeError(f"{type(layer).__name__} keeps {name!r}, a {type(value).__name__}: its state cannot be saved.")
 
