@@ -1,0 +1,308 @@
+"""Figures of several environments at once: curves, profiles and intervals of methods and their variants.
+
+A method may come with settings, as in ``"ae2r Cω=0.03"``: it keeps the method's colour, in a lighter shade and another
+dash for each variant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
+
+from torchrl_priors.metrics import ConfidenceInterval, performance_profile
+from torchrl_priors.plots.style import (
+    BASELINE,
+    COLUMN_WIDTH,
+    TEXT_WIDTH,
+    line_style,
+    method_label,
+    new_figure,
+    outer_labels,
+    paper_style,
+    thousands,
+)
+
+__all__ = ["interval_panels", "profile_panels", "return_curves", "variant_label", "variant_styles"]
+
+_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.2)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
+
+
+def variant_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The line of each method and variant; variants of a method follow each other from dark to light.
+
+    Examples:
+        >>> styles = variant_styles(["e2r", "ae2r Cω=1", "ae2r Cω=0.03"])
+        >>> [style["color"] for style in styles.values()]
+        ['#d55e00', '#0072b2', '#66aad1']
+    """
+    names = list(dict.fromkeys(names))
+    styles = {}
+    for name in names:
+        family = [other for other in names if _base(other) == _base(name)]
+        place = family.index(name)
+        light = 0.6 * place / max(1, len(family) - 1) if len(family) > 2 else 0.4 * place
+        red, green, blue = (part * (1 - light) + light for part in to_rgb(line_style(_base(name))["color"]))
+        style = {**line_style(_base(name)), "color": to_hex((red, green, blue))}
+        if _base(name) != BASELINE:
+            style["linestyle"] = _DASHES[place % len(_DASHES)]
+        styles[name] = style
+    return styles
+
+
+def variant_label(name: str, baseline: str | None = None) -> str:
+    r"""A method and its variant as they are printed; the baseline may have a name of its own.
+
+    Examples:
+        >>> variant_label("ae2r Cω=0.03"), variant_label("none", baseline="PPO")
+        ('AE2R $C_\\omega$=0.03', 'PPO')
+    """
+    base, settings = _base(name), name.partition(" ")[2].replace("Cω", r"$C_\omega$")
+    shown = baseline if base == BASELINE and baseline else method_label(base)
+    return f"{shown} {settings}" if settings else shown
+
+
+def _base(name: str) -> str:
+    return name.partition(" ")[0]
+
+
+@paper_style
+def return_curves(
+    panels: Mapping[str, Mapping[str, ConfidenceInterval]],
+    steps: Mapping[str, Any],
+    *,
+    columns: int | None = None,
+    xlabel: str = "Frames",
+    ylabel: str = "Return",
+    baseline: str | None = None,
+    ylim: tuple[float, float] | None = None,
+    outlined: bool = False,
+    references: Mapping[str, Mapping[str, float]] | None = None,
+) -> Figure:
+    """Curves with bands, a panel per environment (and prior), each with its own scale.
+
+    Args:
+        panels: by title and method, a curve with its interval, arrays ``[points]``.
+        steps: by title, where the points are, ``[points]``; or by title and method, where curves have their own.
+
+    Keyword Args:
+        columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
+        xlabel, ylabel (str): names of the axes.
+        baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
+        ylim (tuple of float, optional): one scale for all panels.
+        outlined (bool): whether bands are drawn by their edges: quantiles, which overlap more than intervals do.
+            Defaults to ``False``.
+        references: by title and name, a level to mark by a thin grey line with its name, e.g. the teacher's return.
+
+    Returns:
+        Figure: as wide as two columns, or one for a single panel.
+
+    Raises:
+        ValueError: there are no curves, or a curve doesn't have the points of its steps; the message names it.
+
+    Examples:
+        >>> band = ConfidenceInterval(np.arange(3.0), np.arange(3.0) - 1, np.arange(3.0) + 1)
+        >>> len(return_curves({"Hopper": {"ae2r Cω=1": band}}, {"Hopper": [0, 50, 100]}).axes)
+        1
+    """
+    names = _names(panels)
+    figure, axes = _panels(panels, columns, row_height=1.75)
+    styles = variant_styles(names)
+    for (title, curves), ax in zip(panels.items(), axes.values(), strict=True):
+        for name, curve in curves.items():
+            where = steps[title]
+            x = np.asarray(where[name] if isinstance(where, Mapping) else where, dtype=np.float64)
+            _draw_band(ax, x, curve, styles[name], f"curve {name!r} of {title!r}", outlined)
+        for name, level in (references or {}).get(title, {}).items():
+            ax.axhline(level, color="0.45", linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1.8)
+            ax.annotate(
+                name,
+                (1, level),
+                xycoords=("axes fraction", "data"),
+                xytext=(-1, 1.5),
+                textcoords="offset points",
+                ha="right",
+                va="bottom",
+                fontsize=6.5,
+                color="0.35",
+            )
+        ax.set_title(title)
+        ax.margins(x=0)
+        if ylim:
+            ax.set_ylim(*ylim)
+        ax.xaxis.set_major_formatter(FuncFormatter(thousands))
+        ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+        ax.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+    outer_labels(axes, xlabel, ylabel, share_y=False)
+    _legend(figure, styles, baseline)
+    return figure
+
+
+@paper_style
+def profile_panels(
+    panels: Mapping[str, Mapping[str, Any]],
+    thresholds: Any = None,
+    *,
+    columns: int | None = None,
+    confidence: float = 0.95,
+    reps: int = 2000,
+    seed: int = 0,
+) -> Figure:
+    r"""Performance profiles, a panel per prior: the share of runs whose area ratio exceeds a threshold.
+
+    The dashed line marks 0, no improvement over the baseline.
+
+    Args:
+        panels: by title and method, area ratios ``[runs]`` or ``[runs, tasks]``.
+        thresholds: ``[points]``, ascending. By default from -1 to what a tenth of the runs exceeds, at least 1.
+
+    Keyword Args:
+        columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
+        confidence (float): of the stratified bootstrap bands. Defaults to 0.95.
+        reps (int): resamples. Defaults to 2000.
+        seed (int): of the resampling. Defaults to 0.
+
+    Returns:
+        Figure: as wide as two columns, or one for a single panel.
+
+    Raises:
+        ValueError: there are no profiles.
+
+    Examples:
+        >>> ratios = np.random.default_rng(0).normal(scale=0.3, size=(5, 2))
+        >>> len(profile_panels({"good": {"e2r": ratios}, "bad": {"e2r": ratios - 0.2}}).axes)
+        2
+    """
+    styles = variant_styles(_names(panels))
+    figure, axes = _panels(panels, columns, row_height=1.75)
+    if thresholds is None:
+        every = np.concatenate([np.ravel(scores) for profiles in panels.values() for scores in profiles.values()])
+        thresholds = np.linspace(-1, min(10.0, max(1.0, np.ceil(2 * np.quantile(every, 0.9)) / 2)), 401)
+    taus = np.asarray(thresholds, dtype=np.float64)
+    for (title, profiles), ax in zip(panels.items(), axes.values(), strict=True):
+        ax.axvline(0, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
+        for name, scores in profiles.items():
+            band = performance_profile(scores, taus, confidence=confidence, reps=reps, seed=seed)
+            _draw_band(ax, taus, band, styles[name], f"profile of {name!r}")
+        ax.set_title(title)
+        ax.set(xlim=(taus.min(), taus.max()), ylim=(0, 1))
+        ax.yaxis.set_major_formatter(PercentFormatter(1.0))
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+    outer_labels(axes, r"Area ratio $\tau$", r"Runs with $r_{\pi_0} > \tau$", share_y=True)
+    _legend(figure, styles, None)
+    return figure
+
+
+@paper_style
+def interval_panels(
+    panels: Mapping[str, Mapping[str, ConfidenceInterval]],
+    *,
+    center: float = 0.0,
+    columns: int | None = None,
+    xlabel: str = r"IQM of $r_{\pi_0}$",
+    xlim: tuple[float, float] | None = None,
+    baseline: str | None = None,
+) -> Figure:
+    """Estimates as lines and their intervals as bars, a row per method and a panel per environment (and prior).
+
+    Args:
+        panels: by title and method, an estimate with its interval, floats.
+
+    Keyword Args:
+        center (float): the dashed line: 0 for a ratio, ½ for a probability. Defaults to 0.
+        columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
+        xlabel (str): name of the axis.
+        xlim (tuple of float, optional): one scale for all panels; else each has its own, which holds the centre.
+        baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
+
+    Returns:
+        Figure: as wide as two columns, or one for a single panel.
+
+    Raises:
+        ValueError: there is nothing to draw.
+
+    Examples:
+        >>> figure = interval_panels({"Hopper": {"e2r": ConfidenceInterval(0.2, 0.1, 0.4)}})
+        >>> [label.get_text() for label in figure.axes[0].get_yticklabels()]
+        ['E2R']
+    """
+    names = _names(panels)
+    styles = variant_styles(names)
+    figure, axes = _panels(panels, columns, row_height=0.45 + 0.19 * len(names), legend=0.0)
+    for (title, intervals), ax in zip(panels.items(), axes.values(), strict=True):
+        for row, name in enumerate(names):
+            if name in intervals:
+                middle, low, high = (float(value) for value in intervals[name])
+                color, point = styles[name]["color"], low == high  # which would have no colour without an edge
+                edge: dict[str, Any] = {"edgecolor": color, "linewidth": 3.5} if point else {"linewidth": 0}
+                ax.barh(row, high - low, left=low, height=0.62, color=color, alpha=0.75, **edge)
+                ax.vlines(middle, row - 0.31, row + 0.31, color="#222222", linewidth=1.3, zorder=3)
+        ax.axvline(center, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
+        ax.set_title(title)
+        ax.set_yticks(range(len(names)), [variant_label(name, baseline) for name in names])
+        ax.set_ylim(len(names) - 0.45, -0.55)
+        ax.tick_params(axis="y", length=0)
+        ax.grid(visible=False, axis="y")
+        ax.spines["left"].set_visible(False)
+        ax.use_sticky_edges = False
+        ax.margins(x=0.06)
+        if xlim:
+            ax.set_xlim(*xlim)
+        ax.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+    outer_labels(axes, xlabel, "", share_y=True)
+    return figure
+
+
+def _names(panels: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    names = list(dict.fromkeys(name for shown in panels.values() for name in shown))
+    if not names:
+        raise ValueError("There is nothing to draw.")
+    return names
+
+
+def _panels(
+    panels: Mapping[str, Any], columns: int | None, *, row_height: float, legend: float = 0.35
+) -> tuple[Figure, dict[tuple[int, int], Axes]]:
+    """An empty panel per title, by row and column."""
+    count = len(panels)
+    columns = min(count, columns or 3)
+    rows = -(-count // columns)
+    width = {1: COLUMN_WIDTH, 2: 1.5 * COLUMN_WIDTH}.get(columns, TEXT_WIDTH)
+    figure = new_figure(width, legend + row_height * rows)
+    grid = figure.add_gridspec(rows, columns)
+    cells = [divmod(index, columns) for index in range(count)]
+    return figure, {cell: figure.add_subplot(grid[cell]) for cell in cells}
+
+
+def _draw_band(
+    ax: Axes, x: Any, band: ConfidenceInterval, style: dict[str, Any], name: str, outlined: bool = False
+) -> None:
+    middle, low, high = (np.asarray(values, dtype=np.float64) for values in band)
+    if not x.shape == middle.shape == low.shape == high.shape:
+        raise ValueError(f"The {name} has {middle.shape} points, its axis {x.shape}.")
+    color = style["color"]
+    ax.fill_between(x, low, high, color=color, alpha=0.06 if outlined else 0.16, linewidth=0, zorder=2)
+    for edge in (low, high) if outlined else ():
+        ax.plot(x, edge, color=color, linewidth=0.6, linestyle=style["linestyle"], zorder=2.5)
+    marker: dict[str, Any] = {"marker": "o", "markersize": 3} if len(x) == 1 else {}
+    ax.plot(x, middle, solid_capstyle="round", **style, **marker)
+
+
+def _legend(figure: Figure, styles: dict[str, dict[str, Any]], baseline: str | None) -> None:
+    handles = [Line2D([], [], label=variant_label(name, baseline), **style) for name, style in styles.items()]
+    # what fits: some six points a letter, and a line before each
+    fits = int(figure.get_figwidth() * 72 / (34 + 4.4 * max(len(_plain(handle.get_label())) for handle in handles)))
+    rows = -(-len(handles) // max(1, fits))
+    columns = -(-len(handles) // rows)
+    figure.set_figheight(figure.get_figheight() + 0.16 * (rows - 1))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, columnspacing=1.4)
+
+
+def _plain(label: Any) -> str:
+    return str(label).replace(r"$C_\omega$", "Cw")
