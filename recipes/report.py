@@ -1,0 +1,205 @@
+"""Report finished runs: tables (CSV), figures (PDF, PNG) and a page in Markdown.
+
+    python -m recipes.report runs=<folder, glob or list> [out=<folder>] [key=value ...]
+
+Runs are those of ``recipes.mujoco`` or studies of ``recipes.gridworld``. A run that isn't finished, or whose data have
+holes, is named and in no table. See ``conf/report.yaml`` for the keys.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pandas as pd
+from omegaconf import OmegaConf
+
+from recipes import report_gridworld
+from recipes.report_config import ReportConfig, check
+from recipes.report_figures import curve_table, figures
+from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
+from recipes.report_runs import LeftOut, find, is_gridworld, name_groups, read, without_misfits
+from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
+from torchrl_priors.plots import save_figure
+
+__all__ = ["main", "report"]
+
+_CAPTIONS = {
+    "return_curves": "Evaluation returns: interquartile mean over seeds",
+    "area_ratios": "Area ratio to the baseline",
+    "performance_profiles": "Performance profiles of the area ratio over environments and seeds",
+    "improvement": "Probability that a run has the larger area under its evaluation curve",
+    "prior_weights": "Prior weight over training: mean, and 5 % to 95 % of the states",
+}
+#: The paper's table: metric, its name, and whether it is the difference to the baseline.
+_DYNAMICS = (
+    ("loss_objective", "policy loss, difference", True),
+    ("entropy", "entropy, difference", True),
+    ("loss_prior", "auxiliary loss", False),
+)
+
+
+def report(cfg: ReportConfig) -> Path:
+    """Write the report; the path of its page.
+
+    Raises:
+        ValueError: a key is wrong, or there is no run that can be used; the message names them.
+    """
+    check(cfg)
+    runs: Any = OmegaConf.to_container(cfg.runs) if OmegaConf.is_config(cfg.runs) else cfg.runs
+    folders = find(runs)
+    studies = [folder for folder in folders if is_gridworld(folder)]
+    out = Path(cfg.out)
+    others = [folder for folder in folders if folder not in studies]
+    if not others:
+        pages = [report_gridworld.write(folder, out / folder.name if len(studies) > 1 else out) for folder in studies]
+        return pages[0] if len(pages) == 1 else _index(out, pages)
+    pages = [report_gridworld.write(folder, out / folder.name) for folder in studies]
+    page = _report_runs(cfg, runs, others, out)
+    return _index(out, [page, *pages]) if pages else page
+
+
+def _index(out: Path, pages: Sequence[Path]) -> Path:
+    links = "\n".join(f"- [{page.parent.name}]({page.relative_to(out)})" for page in pages)
+    return write_text(out / "README.md", f"# Reports\n\n{links}\n")
+
+
+def _report_runs(cfg: ReportConfig, given: str | list[str], folders: Sequence[Path], out: Path) -> Path:
+    found, left_out = read(folders)
+    name_groups(found, cfg)
+    usable, misfits = without_misfits(found)
+    left_out += misfits
+    for entry in left_out:
+        print(f"Left out: {entry.path}: {entry.reason}", file=sys.stderr)
+    if not usable:
+        raise ValueError(f"runs={given}: none of the {len(left_out)} runs can be used (see above).")
+
+    study = Study(usable, cfg)
+    tables = {
+        "returns": return_table(study),
+        "area_ratio": ratio_table(study),
+        "improvement": improvement_table(study),
+        "dynamics": dynamics_table(study),
+        "curves": curve_table(study),
+        "left_out": pd.DataFrame([(str(entry.path), entry.reason) for entry in left_out], columns=["run", "reason"]),
+    }
+    pictures = figures(study, tables["curves"], tables["area_ratio"], tables["improvement"])
+    for name, content in tables.items():
+        write_text(out / f"{name}.csv", content.to_csv(index=False, float_format="%.6g"))
+    for name, figure in pictures.items():
+        save_figure(figure, out / name)
+    used = pd.DataFrame([(run.env, run.prior, run.label, run.seed) for run in usable])
+    used.columns = ["env", "prior", "method", "seed"]
+    page = _page(study, given, used, tables, left_out, list(pictures))
+    return write_text(out / "report.md", page)
+
+
+def _page(
+    study: Study,
+    given: str | list[str],
+    used: pd.DataFrame,
+    tables: dict[str, pd.DataFrame],
+    left_out: Sequence[LeftOut],
+    pictures: Sequence[str],
+) -> str:
+    cfg, level = study.cfg, f"{100 * study.cfg.bootstrap.confidence:g} %"
+    argument = given if isinstance(given, str) else f"[{','.join(map(str, given))}]"
+    parts = [
+        "# Report",
+        f"```bash\npython -m recipes.report runs='{argument}' out={cfg.out}\n```",
+        f"{len(used)} runs. Intervals are {level} stratified bootstrap over seeds ({cfg.bootstrap.reps} resamples); "
+        "IQM is the interquartile mean. With fewer than four seeds it is the mean, and its interval is too narrow. "
+        f"Area: mean return over the evaluations. Baseline: `{cfg.baseline}`.",
+    ]
+    seeds = used.groupby(["env", "prior", "method"], sort=False)["seed"].agg(list).reset_index()
+    parts.append(pivot(seeds.replace({"prior": {"": "-"}}), ["env", "prior"], lambda row: _seeds(row["seed"])))
+    parts += [f"> {note}" for note in study.notes]
+    if left_out:
+        rows = [(f"`{entry.path}`", entry.reason) for entry in left_out]
+        parts.append(f"**Left out** ({len(left_out)}), in no number and no figure here.")
+        parts.append(table(["run", "why"], rows, text_columns=2))
+
+    parts += ["## Returns", _figure("return_curves"), "Last evaluation, IQM over seeds:"]
+    returns = tables["returns"].replace({"prior": {"": "-"}})
+    last = pivot(
+        returns, ["env", "prior"], lambda row: interval(row["final_iqm"], row["final_ci_low"], row["final_ci_high"], 1)
+    )
+    parts += [last, "Mean and standard deviation over seeds:"]
+    parts.append(pivot(returns, ["env", "prior"], lambda row: plus_minus(row["final_mean"], row["final_std"], 1)))
+
+    if len(ratios := tables["area_ratio"]):
+        versus = "of the same seed" if cfg.pairing == "seed" else "on average"
+        parts += ["## Area ratios", f"(A - A₀)/|A₀|, where A₀ is the area of the baseline {versus}. IQM over seeds."]
+        shown = ratios.replace({"env": {ALL: "**all**"}}) if len(study.envs) > 1 else ratios[ratios["env"] != ALL]
+        parts.append(pivot(shown, ["env", "prior"], lambda row: interval(*row[["iqm", "ci_low", "ci_high"]])))
+        parts += [_figure(name) for name in ("area_ratios", "performance_profiles") if name in pictures]
+    if len(improvement := tables["improvement"]):
+        parts += ["## Probability of improvement"]
+        for score, text in (("area", "area under the evaluation curve"), ("final", "return of the last evaluation")):
+            chosen = improvement[improvement["score"] == score]
+            parts += [
+                f"By the {text}; ½ is a draw:",
+                pivot(
+                    chosen, ["env", "prior", "reference"], lambda r: interval(*r[["probability", "ci_low", "ci_high"]])
+                ),
+            ]
+        parts += [_figure(name) for name in pictures if name.startswith("improvement")]
+    parts += ["## Training", _dynamics(tables["dynamics"])]
+    if "prior_weights" in pictures:
+        parts.append(_figure("prior_weights"))
+    files = ", ".join(f"[`{name}.csv`]({name}.csv)" for name in tables)
+    parts.append(f"All numbers: {files}. Figures are there as PDF too.")
+    return "\n\n".join(parts) + "\n"
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    ordered = sorted(seeds)
+    run = len(ordered) > 2 and ordered[-1] - ordered[0] == len(ordered) - 1
+    return f"{ordered[0]}-{ordered[-1]}" if run else ", ".join(map(str, ordered))
+
+
+def _figure(name: str) -> str:
+    caption = _CAPTIONS["improvement" if name.startswith("improvement") else name]
+    return f"![{caption}]({name}.png)"
+
+
+def _dynamics(dynamics: pd.DataFrame) -> str:
+    """The paper's table: mean ± std over training, and the paper's numbers in square brackets."""
+    rows = []
+    for (env, prior, method), group in dynamics.groupby(["env", "prior", "method"], sort=False):
+        by_metric = group.set_index("metric")
+        cells = []
+        for metric, _, differs in _DYNAMICS:
+            row = by_metric.loc[metric] if metric in by_metric.index else None
+            mean, std = ("difference", "difference_std") if differs else ("mean", "std")
+            ours = "-" if row is None else plus_minus(row[mean], row[std], 3)
+            paper = "" if row is None or pd.isna(row["paper_mean"]) else _paper(row["paper_mean"], row["paper_std"])
+            cells.append(ours + paper)
+        if set(cells) != {"-"}:
+            rows.append([env, prior or "-", method, *cells])
+    head = ["env", "prior", "method", *(name for _, name, _ in _DYNAMICS)]
+    text = (
+        "Mean ± standard deviation over training and seeds; differences are to the baseline at the same frames. In "
+        "square brackets what the paper reports with its own teachers (v3 environments; which Cω is not said)."
+    )
+    return f"{text}\n\n{table(head, rows, text_columns=3)}"
+
+
+def _paper(mean: float, std: float) -> str:
+    return f" [{mean:g} ± {std:g}]"
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="report")
+def main(cfg: ReportConfig) -> None:
+    """Write a report and say where it is."""
+    try:
+        print(f"Written: {report(cfg)}")
+    except (ValueError, OSError) as error:
+        sys.exit(f"Error: {error}")
+
+
+if __name__ == "__main__":
+    main()

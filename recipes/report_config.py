@@ -1,0 +1,55 @@
+"""What a report may be configured with: names and types here, defaults in ``conf/report.yaml``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+__all__ = ["Bootstrap", "ReportConfig", "check"]
+
+
+@dataclass
+class Bootstrap:
+    """Confidence intervals."""
+
+    confidence: float = MISSING
+    reps: int = MISSING
+    seed: int = MISSING
+
+
+@dataclass
+class ReportConfig:
+    """The whole configuration of ``python -m recipes.report``."""
+
+    runs: Any = MISSING
+    out: str = MISSING
+    baseline: str = MISSING
+    compare: list[str] = MISSING
+    pairing: str = MISSING
+    rename: dict[str, str] = MISSING
+    same: list[str] = MISSING
+    with_prior: list[str] = MISSING
+    with_bonus: list[str] = MISSING
+    with_weight: list[str] = MISSING
+    abbreviate: dict[str, str] = MISSING
+    bootstrap: Bootstrap = field(default_factory=Bootstrap)
+
+
+ConfigStore.instance().store(group="schema", name="report", node=ReportConfig, package="_global_")
+
+
+def check(cfg: ReportConfig) -> None:
+    """Refuse what would fail or mean nothing later.
+
+    Raises:
+        ValueError: names the key, its value and what was expected.
+    """
+    if cfg.pairing not in ("seed", "mean"):
+        raise ValueError(f"pairing={cfg.pairing}: expected seed or mean.")
+    if not 0 < cfg.bootstrap.confidence < 1:
+        raise ValueError(f"bootstrap.confidence={cfg.bootstrap.confidence}: expected a number in (0, 1).")
+    if cfg.bootstrap.reps < 1:
+        raise ValueError(f"bootstrap.reps={cfg.bootstrap.reps}: expected a positive number.")

@@ -1,0 +1,135 @@
+"""The figures of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from recipes.report_tables import ALL, Study
+from torchrl_priors.methods import get_method
+from torchrl_priors.metrics import ConfidenceInterval
+from torchrl_priors.plots.benchmark import interval_panels, profile_panels, return_curves
+
+__all__ = ["curve_table", "figures"]
+
+_BASELINE = "PPO"
+#: Letters that fit above a panel.
+_TITLE = 30
+
+
+def _title(study: Study, env: str, prior: str) -> str:
+    shown = "All environments" if env == ALL else env
+    title = f"{shown}, {prior}" if prior and len(study.priors) > 1 else shown
+    return title if len(title) <= _TITLE else title.replace(", ", "\n", 1)
+
+
+def _columns(study: Study) -> int | None:
+    """Environments beside each other and priors below, where that makes a full table of panels."""
+    full = len(list(study.panels())) == len(study.envs) * len(study.priors)
+    return len(study.envs) if full and 1 < len(study.envs) <= 4 and len(study.priors) > 1 else None
+
+
+def curve_table(study: Study) -> pd.DataFrame:
+    """IQM of the returns at each evaluation with its pointwise interval, in long form."""
+    tables = []
+    for env, prior, label, runs in study.groups():
+        returns = np.array([run.evaluations["mean_return"] for run in runs])
+        middle, low, high = study.interval(returns[:, None])
+        table = pd.DataFrame({"env": env, "prior": prior, "method": label, "frames": runs[0].evaluations["frames"]})
+        tables.append(table.assign(iqm=middle, ci_low=low, ci_high=high))
+    return pd.concat(tables, ignore_index=True)
+
+
+def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvement: pd.DataFrame) -> dict[str, Figure]:
+    """What there is data for, by the name of the file."""
+    made: dict[str, Figure] = {"return_curves": _return_curves(study, curves)}
+    shown = [(env, prior) for prior in study.priors for env in (*study.envs, ALL)]
+    if panels := _by_panel(study, ratios, shown, ["iqm", "ci_low", "ci_high"]):
+        made["area_ratios"] = interval_panels(panels, columns=_with_all(study, panels))
+        profiles = {
+            prior or "All runs": {
+                label: scores for label in study.labels if (scores := _profile(study, prior, label)) is not None
+            }
+            for prior in study.priors
+        }
+        profiles = {prior: by_method for prior, by_method in profiles.items() if by_method}
+        if profiles:
+            boot = study.cfg.bootstrap
+            made["performance_profiles"] = profile_panels(
+                profiles, confidence=boot.confidence, reps=boot.reps, seed=boot.seed
+            )
+    for reference in study.cfg.compare:
+        chosen = improvement[(improvement["reference"] == reference) & (improvement["score"] == "area")]
+        if panels := _by_panel(study, chosen, shown, ["probability", "ci_low", "ci_high"]):
+            name = _BASELINE if reference == "none" else reference.upper()
+            made[f"improvement_over_{reference}"] = interval_panels(
+                panels,
+                columns=_with_all(study, panels),
+                center=0.5,
+                xlim=(-0.02, 1.02),
+                xlabel=f"P(method > {name}), by area",
+            )
+    if (weights := _prior_weights(study)) is not None:
+        made["prior_weights"] = weights
+    return made
+
+
+def _profile(study: Study, prior: str, label: str) -> np.ndarray | None:
+    return None if label == study.cfg.baseline else study.across(prior, label)
+
+
+def _with_all(study: Study, panels: Mapping[str, object]) -> int | None:
+    """Panels in a row of the figure that has one for all environments at the end of each."""
+    per_prior = len(panels) // len(study.priors)
+    return per_prior if len(study.priors) > 1 and per_prior <= 4 and len(panels) % len(study.priors) == 0 else None
+
+
+def _by_panel(
+    study: Study, table: pd.DataFrame, shown: list[tuple[str, str]], columns: list[str]
+) -> dict[str, dict[str, ConfidenceInterval]]:
+    panels = {}
+    for env, prior in shown:
+        rows = table[(table["env"] == env) & (table["prior"] == prior)]
+        if len(rows) and not (env == ALL and len(study.envs) == 1):
+            values = rows[columns].to_numpy()
+            panels[_title(study, env, prior)] = {
+                method: ConfidenceInterval(*row) for method, row in zip(rows["method"], values, strict=True)
+            }
+    return panels
+
+
+def _return_curves(study: Study, curves: pd.DataFrame) -> Figure:
+    by_group = dict(iter(curves.groupby(["env", "prior", "method"], sort=False)))
+    panels: dict[str, dict[str, ConfidenceInterval]] = {}
+    steps: dict[str, np.ndarray] = {}
+    for env, prior in study.panels():
+        title = _title(study, env, prior)
+        panels[title] = {}
+        for label in study.methods(env, prior):
+            rows = by_group[env, study.runs(env, prior, label)[0].prior, label]
+            panels[title][label] = ConfidenceInterval(*rows[["iqm", "ci_low", "ci_high"]].to_numpy().T)
+            steps[title] = rows["frames"].to_numpy()
+    return return_curves(panels, steps, columns=_columns(study), ylabel="Evaluation return (IQM)", baseline=_BASELINE)
+
+
+def _prior_weights(study: Study) -> Figure | None:
+    """Mean prior weight over training, and the states' 5 % and 95 % quantiles, averaged over seeds."""
+    panels: dict[str, dict[str, ConfidenceInterval]] = {}
+    steps: dict[str, dict[str, np.ndarray]] = {}
+    names = ["prior_weight", "prior_weight_q05", "prior_weight_q95"]
+    for env, prior in study.panels():
+        for label in study.methods(env, prior):
+            runs = study.runs(env, prior, label)
+            if get_method(runs[0].method).adaptive and all(set(names) <= set(run.metrics) for run in runs):
+                mean = pd.concat([run.metrics[["frames", *names]] for run in runs]).groupby("frames").mean()
+                title = _title(study, env, prior)
+                panels.setdefault(title, {})[label] = ConfidenceInterval(*mean[names].to_numpy().T)
+                steps.setdefault(title, {})[label] = mean.index.to_numpy()
+    if not panels:
+        return None
+    return return_curves(
+        panels, steps, columns=_columns(study), ylabel=r"Prior weight $\omega$", ylim=(0, 1), outlined=True
+    )

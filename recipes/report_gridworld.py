@@ -1,0 +1,142 @@
+"""The page and figures of a gridworld study, from the tables in its folder."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+from omegaconf import OmegaConf
+
+from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
+from torchrl_priors.metrics import ConfidenceInterval
+from torchrl_priors.plots import iqm_bars, learning_curves, method_label, prior_label, save_figure
+
+__all__ = ["write"]
+
+_TABLES = ("area_ratio", "curves", "comparisons", "prior_weights", "worlds")
+#: Needs every world's curves, which are in no table: taken from the folder where it is there.
+_TAKEN = ("performance_profiles.pdf", "performance_profiles.png", "world.pdf", "world.png")
+
+
+def write(folder: Path, out: Path) -> Path:
+    """Write ``report.md`` and its figures into ``out``; the path of the page.
+
+    Raises:
+        ValueError: a table is missing, damaged or has holes; the message names it.
+    """
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    tables = {name: _table(folder / f"{name}.csv", optional=name not in _TABLES[:2]) for name in _TABLES}
+    for name, figure in _figures(tables).items():
+        save_figure(figure, out / name)
+    for name in _TAKEN:
+        if (folder / name).exists() and folder.resolve() != out.resolve():
+            shutil.copyfile(folder / name, out / name)
+    return write_text(out / "report.md", _page(folder, out, config, tables))
+
+
+def _table(file: Path, *, optional: bool) -> pd.DataFrame:
+    if optional and not file.exists():
+        return pd.DataFrame()
+    try:
+        frame = pd.read_csv(file)
+    except FileNotFoundError:
+        raise ValueError(f"{file} is missing: is the study finished?") from None
+    except ValueError as error:
+        raise ValueError(f"{file} is damaged ({error}).") from None
+    holes = [name for name in frame if not name.startswith("paper_") and frame[name].isna().any()]
+    if holes and not optional:
+        raise ValueError(f"{file} has values missing in {', '.join(holes)}.")
+    return frame
+
+
+def _figures(tables: dict[str, pd.DataFrame]) -> dict[str, Figure]:
+    ratios, curves = tables["area_ratio"], tables["curves"]
+    bars: dict[str, dict[str, ConfidenceInterval]] = {}
+    paper: dict[str, dict[str, ConfidenceInterval]] = {}
+    for _, row in ratios.iterrows():
+        bars.setdefault(row["prior"], {})[row["method"]] = ConfidenceInterval(*row[["iqm", "ci_low", "ci_high"]])
+        if "paper_iqm" in row and pd.notna(row["paper_iqm"]):
+            values = row[["paper_iqm", "paper_ci_low", "paper_ci_high"]]
+            paper.setdefault(row["prior"], {})[row["method"]] = ConfidenceInterval(*values)
+    lines: dict[str, dict[str, ConfidenceInterval]] = {prior: {} for prior in bars}
+    baseline = None
+    for (prior, method), rows in curves.groupby(["prior", "method"], sort=False):
+        curve = ConfidenceInterval(*rows[["mean", "ci_low", "ci_high"]].to_numpy().T)
+        if method == "none":
+            baseline = curve
+        else:
+            lines[prior][method] = curve
+    steps = curves["transitions"].unique()
+    return {
+        "learning_curves": learning_curves(lines, baseline=baseline, steps=steps),
+        "iqm": iqm_bars(bars, reference=paper or None),
+    }
+
+
+def _page(folder: Path, out: Path, config: dict[str, Any], tables: dict[str, pd.DataFrame]) -> str:
+    level = "IQM over worlds of the area ratio x 1000 (95 % bootstrap interval)"
+    parts = [
+        f"# Gridworld study: {folder.name}",
+        f"{config['worlds']} worlds from seed {config['seed']}, `td_error={config['td_error']}`; "
+        "all settings in `config.yaml` of the study's folder.",
+        f"```bash\npython -m recipes.report runs={folder} out={out}\n```",
+        "## Area ratios",
+        level + "; in square brackets what the paper reports.",
+        _named(tables["area_ratio"], _ratio),
+        "![Area ratios per prior](iqm.png)",
+        "## Learning curves",
+        "![Learning curves, mean and 95 % band over worlds](learning_curves.png)",
+    ]
+    if (out / "performance_profiles.png").exists():
+        parts.append("![Performance profiles](performance_profiles.png)")
+    if len(comparisons := tables["comparisons"]):
+        pairs = comparisons.assign(
+            method=[
+                f"{method_label(a)} - {method_label(b)}"
+                for a, b in zip(comparisons["method"], comparisons["reference"], strict=True)
+            ]
+        )
+        parts += [
+            "## Methods against each other",
+            "Difference of IQMs on the same worlds x 1000:",
+            _named(pairs, lambda row: _thousandths(*row[["iqm_difference", "ci_low", "ci_high"]])),
+        ]
+    if len(weights := tables["prior_weights"]):
+        parts += ["## Prior weight in evaluation episodes", "Mean ± half of the 95 % interval:", _weights(weights)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _named(frame: pd.DataFrame, cell: Any) -> str:
+    shown = frame.assign(prior=frame["prior"].map(prior_label), method=frame["method"].map(method_label))
+    return pivot(shown, ["prior"], cell)
+
+
+def _ratio(row: pd.Series) -> str:
+    paper = f" [{_whole(row['paper_iqm'])}]" if "paper_iqm" in row and pd.notna(row["paper_iqm"]) else ""
+    return _thousandths(*row[["iqm", "ci_low", "ci_high"]]) + paper
+
+
+def _thousandths(*values: float) -> str:
+    estimate, low, high = (1000 * value for value in values)
+    return interval(estimate, low, high, digits=0)
+
+
+def _whole(value: float) -> str:
+    return f"{1000 * value:.0f}"
+
+
+def _weights(weights: pd.DataFrame) -> str:
+    rows = [
+        [
+            prior_label(row["prior"]),
+            method_label(row["method"]),
+            row["average"],
+            plus_minus(row["degraded"], row["degraded_ci"], 3),
+            plus_minus(row["non_degraded"], row["non_degraded_ci"], 3),
+        ]
+        for _, row in weights.iterrows()
+    ]
+    return table(["prior", "method", "average over", "degraded", "non-degraded"], rows, text_columns=3)

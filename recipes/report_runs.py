@@ -1,0 +1,266 @@
+"""Runs found and read for a report, told apart by environment, prior and method; what cannot be used, and why not."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from omegaconf import OmegaConf
+
+from recipes.report_config import ReportConfig
+from torchrl_priors.methods import METHODS, get_method
+
+__all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "without_misfits"]
+
+
+@dataclass
+class Run:
+    """A finished run whose data are whole."""
+
+    path: Path
+    env: str
+    degrade: str  # how its prior is degraded, "none" if it isn't, "" without a prior
+    method: str
+    seed: int
+    settings: dict[str, Any]
+    evaluations: pd.DataFrame
+    metrics: pd.DataFrame
+    prior: str = ""  # how it is called; "" without one
+    label: str = ""  # method, and what tells it apart
+
+    @property
+    def degraded(self) -> bool:
+        """Whether its prior is made worse on purpose."""
+        return self.degrade not in ("", "none")
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A run that is in no table and no figure."""
+
+    path: Path
+    reason: str
+
+
+class _UnusableError(Exception):
+    """Why a run is left out."""
+
+
+def find(runs: Any) -> list[Path]:
+    """The folders of runs that a folder, a glob or a list of those stands for, each once.
+
+    Raises:
+        ValueError: nothing is there; the message names what was looked for.
+    """
+    patterns = [runs] if isinstance(runs, str) else list(runs)
+    found: list[Path] = []
+    for pattern in patterns:
+        below = [path for name in sorted(glob(str(pattern), recursive=True)) for path in _below(Path(name))]
+        if not below:
+            raise ValueError(f"runs={pattern}: no folder with a config.yaml or a status.json is there.")
+        found += below
+    return list(dict.fromkeys(found))
+
+
+def _below(folder: Path) -> list[Path]:
+    files = [folder / name for name in ("config.yaml", "status.json")] if folder.is_dir() else []
+    if any(file.exists() for file in files):
+        return [folder]
+    inner = {file.parent for name in ("config.yaml", "status.json") for file in folder.rglob(name)}
+    return sorted(path for path in inner if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+
+
+def is_gridworld(folder: Path) -> bool:
+    """Whether ``recipes.gridworld`` wrote the folder."""
+    if (folder / "area_ratio.csv").exists():
+        return True
+    config = folder / "config.yaml"
+    return not (folder / "status.json").exists() and config.exists() and "\nworlds:" in f"\n{config.read_text()}"
+
+
+def read(folders: Iterable[Path]) -> tuple[list[Run], list[LeftOut]]:
+    """The runs in their folders, and those that are not to be used."""
+    results = [_read(folder) for folder in folders]
+    runs = [result for result in results if isinstance(result, Run)]
+    return runs, [result for result in results if isinstance(result, LeftOut)]
+
+
+def _read(folder: Path) -> Run | LeftOut:
+    try:
+        return _read_whole(folder)
+    except _UnusableError as reason:
+        return LeftOut(folder, str(reason))
+
+
+def _read_whole(folder: Path) -> Run:
+    _check_finished(folder)
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
+        method, seed, env = str(config["method"]), int(config["seed"]), _env(config["env"])
+        auxiliary = get_method(method).auxiliary
+    except FileNotFoundError:
+        raise _UnusableError("config.yaml is missing") from None
+    except Exception as error:  # whatever reading a damaged file ends in
+        raise _UnusableError(f"config.yaml cannot be used ({type(error).__name__}: {error})") from None
+    needed = ["frames", "loss_objective", "entropy"] + ["loss_prior"] * auxiliary
+    return Run(
+        path=folder,
+        env=env,
+        degrade="" if method == "none" else str((config.get("prior") or {}).get("degrade") or "none"),
+        method=method,
+        seed=seed,
+        settings=_flatten(config),
+        evaluations=_table(folder / "eval.csv", ["frames", "mean_return"], optional=()),
+        metrics=_table(folder / "metrics.csv", needed, optional=("episode*",)),
+    )
+
+
+def _check_finished(folder: Path) -> None:
+    try:
+        status = json.loads((folder / "status.json").read_text())
+        state = status["state"]
+    except FileNotFoundError:
+        raise _UnusableError("status.json is missing") from None
+    except (ValueError, TypeError, KeyError, OSError):
+        raise _UnusableError("status.json is damaged") from None
+    if state == "failed":
+        raise _UnusableError(f"it failed: {status.get('error') or 'no reason given'}")
+    if state != "finished":
+        raise _UnusableError(f"it is not finished (state {state}, {status.get('frames', 'unknown')} frames)")
+
+
+def _table(file: Path, needed: Sequence[str], optional: Sequence[str]) -> pd.DataFrame:
+    """A CSV whose needed columns are there, and without a hole in any column that isn't off (empty) as a whole."""
+    try:
+        table = pd.read_csv(file)
+    except FileNotFoundError:
+        raise _UnusableError(f"{file.name} is missing") from None
+    except (ValueError, OSError) as error:
+        raise _UnusableError(f"{file.name} is damaged ({error})") from None
+    if absent := [name for name in needed if name not in table]:
+        raise _UnusableError(f"{file.name} has no column {', '.join(absent)}")
+    if table.empty:
+        raise _UnusableError(f"{file.name} has no rows")
+    for name in table.columns:
+        values = pd.to_numeric(table[name], errors="coerce")
+        bad = ~np.isfinite(values.to_numpy(dtype=np.float64))
+        off = bad.all() and name not in needed and table[name].isna().all()
+        if bad.any() and not off and not any(fnmatchcase(name, pattern) for pattern in optional):
+            where = "" if name == "frames" else f", first at {table['frames'][int(bad.argmax())]:g} frames"
+            raise _UnusableError(f"{file.name} has {int(bad.sum())} values of {name} that are not finite{where}")
+        table[name] = values
+    if not table["frames"].is_monotonic_increasing or table["frames"].duplicated().any():
+        raise _UnusableError(f"frames in {file.name} do not increase")
+    return table
+
+
+def _env(node: Any) -> str:
+    """The name of an environment with its version, from the group ``env`` or a plain name."""
+    if not isinstance(node, dict):
+        return str(node)
+    name, version = str(node["id"]), node.get("version")
+    name = name if version is None or name.endswith(f"-{version}") else f"{name}-{version}"
+    changed = ", ".join(f"{key}={_short(value)}" for key, value in (node.get("kwargs") or {}).items())
+    return f"{name} ({changed})" if changed else name
+
+
+def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in config.items():
+        flat.update(_flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value})
+    return flat
+
+
+def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
+    """Name each run's prior and method, and the settings that runs of one kind in one environment differ in."""
+    taught = [run for run in runs if run.degrade]
+    for run, told in zip(taught, _differences(taught, lambda run: run.degrade, _prior_settings), strict=True):
+        kind = f"{run.degrade} degradation" if run.degraded else "teacher"
+        settings = (Path(str(value)).stem if key == "path" else f"{key}={_short(value)}" for key, value in told.items())
+        run.prior = ", ".join([kind, *settings])
+    differences = _differences(runs, lambda run: run.method, lambda run: _method_settings(run, cfg))
+    for run, told in zip(runs, differences, strict=True):
+        settings = (f"{cfg.abbreviate.get(key, key)}={_short(value)}" for key, value in told.items())
+        label = " ".join([run.method, *settings])
+        run.label = cfg.rename.get(label, label)
+
+
+def _differences(
+    runs: Sequence[Run], kind: Callable[[Run], str], settings: Callable[[Run], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Of each run's settings those in which runs of its kind differ, in whichever environment they do."""
+    values: dict[tuple[str, str, str], list[str]] = defaultdict(list)
+    counts = Counter((kind(run), run.env) for run in runs)
+    for run in runs:
+        for key, value in settings(run).items():
+            values[kind(run), run.env, key].append(json.dumps(value, sort_keys=True, default=str))
+    varied = {
+        (name, key)
+        for (name, env, key), found in values.items()
+        if len(set(found)) > 1 or len(found) < counts[name, env]
+    }
+    return [
+        {key: settings(run).get(key, "default") for name, key in sorted(varied) if name == kind(run)} for run in runs
+    ]
+
+
+def _prior_settings(run: Run) -> dict[str, Any]:
+    meaningful = {"structural": ("path", "feature", "threshold"), "random": ("path", "prob")}.get(
+        run.degrade, ("path",)
+    )
+    return {key: run.settings.get(f"prior.{key}") for key in meaningful}
+
+
+def _method_settings(run: Run, cfg: ReportConfig) -> dict[str, Any]:
+    patterns = list(cfg.same)
+    spec = get_method(run.method)
+    patterns += cfg.with_prior if run.method == "none" else []
+    patterns += cfg.with_bonus if spec.bonus == "none" else []
+    patterns += [] if spec.adaptive else cfg.with_weight
+    patterns.append("method")
+    return {
+        key: value for key, value in run.settings.items() if not any(fnmatchcase(key, pattern) for pattern in patterns)
+    }
+
+
+def _short(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def without_misfits(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
+    """The runs that can be averaged: one per seed, evaluated when most runs of the environment are; in order."""
+    grids = {
+        env: Counter(tuple(run.evaluations["frames"]) for run in runs if run.env == env).most_common(1)[0][0]
+        for env in {run.env for run in runs}
+    }
+    kept: dict[tuple[str, str, str, int], Run] = {}
+    left_out = []
+    for run in runs:
+        grid = grids[run.env]
+        key = (run.env, run.prior, run.label, run.seed)
+        if tuple(run.evaluations["frames"]) != grid:
+            own = run.evaluations["frames"]
+            left_out.append(
+                LeftOut(
+                    run.path,
+                    f"it was evaluated {len(own)} times up to {own.iloc[-1]:g} frames, most runs in {run.env} "
+                    f"{len(grid)} times up to {grid[-1]:g}",
+                )
+            )
+        elif key in kept:
+            left_out.append(LeftOut(run.path, f"it repeats {kept[key].path} (same method, prior and seed)"))
+        else:
+            kept[key] = run
+    order = list(METHODS)
+    usable = sorted(
+        kept.values(), key=lambda run: (run.env, run.degraded, run.prior, order.index(run.method), run.label, run.seed)
+    )
+    return usable, left_out
