@@ -14,6 +14,7 @@ pytest.importorskip("gymnasium")
 
 from collectors_cases import deterministic, gaussian, same, scripts, squashed
 from gymnasium.vector import AutoresetMode
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import Compose, DoubleToFloat
@@ -31,6 +32,14 @@ def collector(policy: Any = None, *, frames: int = 24, **kwargs: Any) -> VectorC
     kwargs.setdefault("seed", 0)
     env = kwargs.pop("env", None) or scripts(*LENGTHS)
     return VectorCollector(env, policy or gaussian(3, 2), frames_per_batch=frames, **kwargs)
+
+
+def noise(batch: TensorDictBase) -> torch.Tensor:
+    """The standard normal numbers behind the actions of a Gaussian policy, squashed or not, ``[N * T, 2]``."""
+    action = batch["action"]
+    if action.abs().max() < 1:
+        action = action.atanh()
+    return ((action - batch["loc"]) / batch["scale"]).reshape(-1, 2)
 
 
 class TestEpisodes:
@@ -176,11 +185,16 @@ class TestPolicy:
     @pytest.mark.parametrize("policy", [gaussian, squashed])
     def test_actions_are_distributed_as_the_policy_says(self, policy: Callable) -> None:
         batch = collector(policy(3, 2), frames=3 * 700).rollout()  # more steps than noise is drawn for at once
-        raw = batch["action"].clamp(-1 + 1e-6, 1 - 1e-6).atanh() if policy is squashed else batch["action"]
-        noise = ((raw - batch["loc"]) / batch["scale"]).reshape(-1, 2)
-        assert noise.unique(dim=0).shape[0] == noise.shape[0]
-        assert noise.mean(0).abs().max() < 0.1  # 4.5 standard errors
-        assert (noise.std(0) - 1).abs().max() < 0.07
+        drawn = noise(batch)
+        assert drawn.unique(dim=0).shape[0] == drawn.shape[0]
+        assert drawn.mean(0).abs().max() < 0.1  # 4.5 standard errors
+        assert (drawn.std(0) - 1).abs().max() < 0.07
+
+    @pytest.mark.parametrize("policy", [gaussian, squashed])
+    def test_no_two_rollouts_draw_the_same_numbers(self, policy: Callable) -> None:
+        collecting = collector(policy(3, 2))
+        first, second = (noise(collecting.rollout()) for _ in range(2))
+        assert (first - second).abs().min() > 1e-5
 
     def test_both_ways_to_run_a_gaussian_policy_say_the_same_of_an_action(self) -> None:
         actor, hooked = (gaussian(3, 2) for _ in range(2))

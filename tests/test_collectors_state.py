@@ -90,6 +90,13 @@ class TestContinuing:
         second.load_state_dict(first.state_dict())
         assert same(first.rollout(), second.rollout())
 
+    def test_the_frames_before_count(self) -> None:
+        first = collector(total_frames=120)
+        rollouts(first, 2)
+        second = collector(seed=1, policy=first.policy, total_frames=120)
+        second.load_state_dict(first.state_dict())
+        assert len(list(second)) == 1
+
     def test_a_saved_state_does_not_move_on_with_its_collector(self) -> None:
         first = collector()
         state = first.state_dict()
