@@ -182,15 +182,25 @@ def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
     """Name each run's prior and method, and the settings that runs of one kind in one environment differ in."""
     taught = [run for run in runs if run.degrade]
+    files = _short_paths({str(run.settings.get("prior.path")) for run in taught})
     for run, told in zip(taught, _differences(taught, lambda run: run.degrade, _prior_settings), strict=True):
         kind = f"{run.degrade} degradation" if run.degraded else "teacher"
-        settings = (Path(str(value)).stem if key == "path" else f"{key}={_short(value)}" for key, value in told.items())
+        settings = (files[str(value)] if key == "path" else f"{key}={_short(value)}" for key, value in told.items())
         run.prior = ", ".join([kind, *settings])
     differences = _differences(runs, lambda run: run.method, lambda run: _method_settings(run, cfg))
     for run, told in zip(runs, differences, strict=True):
         settings = (f"{cfg.abbreviate.get(key, key)}={_short(value)}" for key, value in told.items())
         label = " ".join([run.method, *settings])
         run.label = cfg.rename.get(label, label)
+
+
+def _short_paths(paths: set[str]) -> dict[str, str]:
+    """Names of files by as few of their last folders as tell them apart."""
+    parts = {path: Path(path).with_suffix("").parts for path in paths}
+    depth = 1
+    while len({names[-depth:] for names in parts.values()}) < len(set(parts.values())):
+        depth += 1
+    return {path: "/".join(names[-depth:]) for path, names in parts.items()}
 
 
 def _differences(

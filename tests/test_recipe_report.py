@@ -103,6 +103,13 @@ def test_a_variant_run_in_one_environment_only_is_named_alike_in_the_others(tmp_
     assert study.methods("Hopper-v5", "teacher") == ["ae2r Cω=0.3", "ae2r Cω=1"]
 
 
+def test_teachers_of_one_environment_are_told_apart_by_their_files(tmp_path: Path) -> None:
+    for name in ("hopper-1", "hopper-2"):
+        settings = {"prior": {"path": f"runs/{name}/policy.safetensors", "degrade": "none"}}
+        write_run(tmp_path / name, method="e2r", config=settings)
+    assert study_of(tmp_path).priors == ["teacher, hopper-1/policy", "teacher, hopper-2/policy"]
+
+
 def test_environments_with_other_versions_or_arguments_are_other_environments(tmp_path: Path) -> None:
     write_run(tmp_path / "a", config={"env": {"id": "Hopper", "version": "v4", "kwargs": {}}})
     write_run(tmp_path / "b", config={"env": {"id": "Hopper", "version": "v5", "kwargs": {"ctrl_cost_weight": 0.001}}})
