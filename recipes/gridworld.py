@@ -155,17 +155,18 @@ def students(cfg: GridworldConfig, folder: RunFolder) -> np.ndarray:
         Block(cfg, folder, f"blocks/{first:06d}-{size}", slice(begin, begin + size))
         for first, begin in zip(firsts, begins, strict=True)
     ]
-    missing = [block for block in blocks if not folder.has(block.name)]
+    # Read at once what is there, so that a damaged file is found before any work.
+    kept = {block.name: folder.arrays(block.name)["episodes"] for block in blocks if folder.has(block.name)}
+    missing = [block for block in blocks if block.name not in kept]
     budget = size * pairs * cfg.evaluation.points * cfg.evaluation.interval
     with tqdm(total=len(blocks) * budget, unit="step", unit_scale=True, desc="students") as bar:
         bar.update((len(blocks) - len(missing)) * budget)
         # Runs end with an episode, a little after their budget.
         run_all(train_block, missing, workers, lambda steps: bar.update(min(steps, bar.total - bar.n)))
         bar.update(bar.total - bar.n)
-    kept = [folder.arrays(block.name)["episodes"] for block in blocks]
-    return np.concatenate(
-        [episodes[first - begin :] for episodes, first, begin in zip(kept, firsts, begins, strict=True)]
-    )
+    kept |= {block.name: folder.arrays(block.name)["episodes"] for block in missing}
+    offsets = [first - begin for first, begin in zip(firsts, begins, strict=True)]
+    return np.concatenate([kept[block.name][offset:] for block, offset in zip(blocks, offsets, strict=True)])
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="gridworld")
