@@ -132,7 +132,7 @@ def return_curves(
                 fontsize=6.5,
                 color="0.35",
             )
-        ax.set_title(title)
+        ax.set_title(title, linespacing=0.95)
         ax.margins(x=0)
         if ylim:
             ax.set_ylim(*ylim)
@@ -160,7 +160,8 @@ def profile_panels(
 
     Args:
         panels: by title and method, area ratios ``[runs]`` or ``[runs, tasks]``.
-        thresholds: ``[points]``, ascending. By default from -1 to what a tenth of the runs exceeds, at least 1.
+        thresholds: ``[points]``, ascending. By default from -1 to what one run in fifty exceeds, at least 1
+            and at most 10.
 
     Keyword Args:
         columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
@@ -183,14 +184,14 @@ def profile_panels(
     figure, axes = _panels(panels, columns, row_height=1.75)
     if thresholds is None:
         every = np.concatenate([np.ravel(scores) for profiles in panels.values() for scores in profiles.values()])
-        thresholds = np.linspace(-1, min(10.0, max(1.0, np.ceil(2 * np.quantile(every, 0.9)) / 2)), 401)
+        thresholds = np.linspace(-1, min(10.0, max(1.0, np.ceil(4 * np.quantile(every, 0.98)) / 4)), 401)
     taus = np.asarray(thresholds, dtype=np.float64)
     for (title, profiles), ax in zip(panels.items(), axes.values(), strict=True):
         ax.axvline(0, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
         for name, scores in profiles.items():
             band = performance_profile(scores, taus, confidence=confidence, reps=reps, seed=seed)
             _draw_band(ax, taus, band, styles[name], f"profile of {name!r}")
-        ax.set_title(title)
+        ax.set_title(title, linespacing=0.95)
         ax.set(xlim=(taus.min(), taus.max()), ylim=(0, 1))
         ax.yaxis.set_major_formatter(PercentFormatter(1.0))
         ax.xaxis.set_major_locator(MaxNLocator(5))
@@ -244,7 +245,7 @@ def interval_panels(
                 ax.barh(row, high - low, left=low, height=0.62, color=color, alpha=0.75, **edge)
                 ax.vlines(middle, row - 0.31, row + 0.31, color="#222222", linewidth=1.3, zorder=3)
         ax.axvline(center, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
-        ax.set_title(title)
+        ax.set_title(title, linespacing=0.95)
         ax.set_yticks(range(len(names)), [variant_label(name, baseline) for name in names])
         ax.set_ylim(len(names) - 0.45, -0.55)
         ax.tick_params(axis="y", length=0)
