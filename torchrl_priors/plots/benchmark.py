@@ -132,7 +132,7 @@ def return_curves(
                 fontsize=6.5,
                 color="0.35",
             )
-        ax.set_title(title, linespacing=0.95)
+        ax.set_title(title, linespacing=1.05)
         ax.margins(x=0)
         if ylim:
             ax.set_ylim(*ylim)
@@ -191,7 +191,7 @@ def profile_panels(
         for name, scores in profiles.items():
             band = performance_profile(scores, taus, confidence=confidence, reps=reps, seed=seed)
             _draw_band(ax, taus, band, styles[name], f"profile of {name!r}")
-        ax.set_title(title, linespacing=0.95)
+        ax.set_title(title, linespacing=1.05)
         ax.set(xlim=(taus.min(), taus.max()), ylim=(0, 1))
         ax.yaxis.set_major_formatter(PercentFormatter(1.0))
         ax.xaxis.set_major_locator(MaxNLocator(5))
@@ -245,7 +245,7 @@ def interval_panels(
                 ax.barh(row, high - low, left=low, height=0.62, color=color, alpha=0.75, **edge)
                 ax.vlines(middle, row - 0.31, row + 0.31, color="#222222", linewidth=1.3, zorder=3)
         ax.axvline(center, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
-        ax.set_title(title, linespacing=0.95)
+        ax.set_title(title, linespacing=1.05)
         ax.set_yticks(range(len(names)), [variant_label(name, baseline) for name in names])
         ax.set_ylim(len(names) - 0.45, -0.55)
         ax.tick_params(axis="y", length=0)
