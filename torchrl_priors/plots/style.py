@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from PIL import Image
 
 __all__ = ["method_color", "method_label", "prior_label", "save_figure"]
 
@@ -248,19 +247,9 @@ def save_figure(
                 metadata=undated.get(suffix),
             )
         file = target.with_name(f"{target.name}.{suffix}")
-        _replace(file, _with_palette(buffer, dpi) if suffix == "png" else buffer.getvalue())
+        _replace(file, buffer.getvalue())
         written.append(file)
     return written
-
-
-def _with_palette(png: io.BytesIO, dpi: int) -> bytes:
-    """A PNG of at most 256 colours: a third of the size, and no visible difference for lines and bands."""
-    small = io.BytesIO()
-    with Image.open(png) as image:
-        # maximum coverage keeps rare colours (a thin frame) true, where the default merges them into common ones
-        palette = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        palette.save(small, "png", optimize=True, dpi=(dpi, dpi))
-    return small.getvalue()
 
 
 def _replace(file: Path, content: bytes) -> None:

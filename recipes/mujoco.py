@@ -1,0 +1,233 @@
+"""PPO with an AVEC critic on MuJoCo, learning from a teacher by any of the methods.
+
+    python -m recipes.mujoco env=hopper method=ae2r prior.path=teacher.safetensors [key=value ...]
+
+A run keeps everything in one folder: ``eval.csv``, ``metrics.csv``, checkpoints and, at the end, the teacher that it
+makes, ``policy.safetensors``. An interrupted run continues with the same command; a finished one is not run again. See
+``conf/mujoco.yaml`` for the keys.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import hydra
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+import recipes.launchers  # noqa: F401  (hydra/launcher=cores)
+from recipes.mujoco_config import MujocoConfig, check
+from recipes.mujoco_run import Run, supervise
+from torchrl_priors import (
+    ActionPrior,
+    AVECMixin,
+    ClipPPOPriorLoss,
+    PriorBonus,
+    PriorLogProb,
+    RandomDegradation,
+    StructuralDegradation,
+    ValueOffset,
+    get_method,
+)
+from torchrl_priors.artifacts import load_prior
+from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate, make_vector_env
+from torchrl_priors.networks import make_actor, make_critic, make_prior_weight
+
+
+class AVECClipPPOLoss(AVECMixin, ClipPPOLoss):
+    """PPO whose critic minimises the variance of its residual."""
+
+
+class AVECClipPPOPriorLoss(AVECMixin, ClipPPOPriorLoss):
+    """The same with a prior."""
+
+
+def make_prior(cfg: MujocoConfig, env_id: str, obs_dim: int, act_dim: int) -> ActionPrior:
+    """The teacher, degraded as the configuration says."""
+    assert cfg.prior.path is not None
+    prior: ActionPrior = load_prior(cfg.prior.path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
+    if cfg.prior.degrade == "structural":
+        feature, threshold = cfg.prior.feature, cfg.prior.threshold
+        return StructuralDegradation(prior, lambda td: td["observation"][..., feature] > threshold)
+    if cfg.prior.degrade == "random":
+        return RandomDegradation(prior, cfg.prior.prob, seed=cfg.seed)
+    return prior
+
+
+class Agent(nn.Module):
+    """The networks of a run, its loss, and how a rollout is prepared for it."""
+
+    def __init__(self, cfg: MujocoConfig, env_id: str, obs_dim: int, act_dim: int) -> None:
+        super().__init__()
+        spec = get_method(cfg.method)
+        hidden = list(cfg.ppo.hidden)
+        self.spec, self.cfg = spec, cfg
+        self.normalizer = RunningNorm(obs_dim)
+        self.actor = make_actor(obs_dim, act_dim, hidden)
+        self.critic = make_critic(obs_dim, hidden)
+        self.critic.module = nn.Sequential(self.critic.module, ValueOffset())
+        options: dict[str, Any] = {"centering": cfg.centering, "bonus_coeff": cfg.bonus_coeff}
+        ppo: dict[str, Any] = {
+            "clip_epsilon": cfg.ppo.clip_epsilon,
+            "entropy_bonus": True,
+            "entropy_coeff": cfg.ppo.entropy_coeff,
+            "critic_coeff": 1.0,
+            "normalize_advantage": True,
+            "functional": False,
+            "log_explained_variance": False,
+        }
+        self.advantage = GAE(gamma=cfg.ppo.gamma, lmbda=cfg.ppo.gae_lambda, value_network=self.critic)
+        self.transforms: list[Any] = []
+        self.weight, self.raw_critic = None, None
+        if cfg.method == "none":
+            self.loss: nn.Module = AVECClipPPOLoss(self.actor, self.critic, **ppo)
+            return
+        prior = make_prior(cfg, env_id, obs_dim, act_dim)
+        if spec.adaptive:
+            self.weight = make_prior_weight(obs_dim, hidden, init_bias=cfg.weight.init_bias)
+            if cfg.td_error == "original" and spec.weight_target == "td":
+                self.raw_critic = make_critic(obs_dim, hidden)
+        self.transforms.append(PriorLogProb(prior, self.actor, centering=options["centering"]))
+        if spec.bonus != "none":
+            self.transforms.append(PriorBonus.from_method(cfg.method, self.weight, **options))
+            self.advantage.set_keys(reward="shaped_reward")
+        options["td_error"] = cfg.td_error
+        self.loss = AVECClipPPOPriorLoss(
+            self.actor,
+            self.critic,
+            prior,
+            self.weight,
+            self.raw_critic,
+            method=cfg.method,
+            aux_coeff=cfg.aux_coeff,
+            gamma=cfg.ppo.gamma,
+            **options,
+            **ppo,
+        )
+        if spec.weight_target == "advantage" and spec.bonus == "none":
+            # without a bonus PPO's own advantage is one on raw rewards
+            self.loss.set_keys(raw_advantage="advantage")
+
+    def networks(self) -> dict[str, nn.Module]:
+        """What is trained, by name."""
+        networks = {"actor": self.actor, "critic": self.critic, "weight": self.weight, "raw_critic": self.raw_critic}
+        return {name: network for name, network in networks.items() if network is not None}
+
+    @torch.no_grad()
+    def prepare(self, rollout: TensorDictBase) -> TensorDictBase:
+        """Score the rollout under the prior, shape its rewards, estimate advantages: once, for all epochs."""
+        for transform in self.transforms:
+            rollout = transform(rollout)
+        rollout = self.advantage(rollout)
+        # Fewer entries make for faster minibatches.
+        keys: Any = self.loss.in_keys
+        read = [*keys, "advantage", "value_target", ("next", "prior_bonus")]
+        return rollout.select(*read, strict=False)
+
+
+def minibatches(batch: TensorDictBase, size: int, epochs: int) -> Iterator[TensorDictBase]:
+    """Random minibatches of the flat batch, every step once per epoch."""
+    for _ in range(epochs):
+        for chosen in torch.randperm(len(batch)).split(size):
+            yield batch[chosen]
+
+
+def optimise(agent: Agent, optimizer: torch.optim.Optimizer, rollout: TensorDictBase) -> dict[str, Tensor]:
+    """The epochs on one rollout; the mean of everything that the loss reports."""
+    cfg, batch = agent.cfg, rollout.reshape(-1)
+    groups = [list(network.parameters()) for network in agent.networks().values()]
+    later = cfg.weight.trained == "rollout"
+    sums: dict[str, Tensor] = {}
+    count = 0
+    for minibatch in minibatches(batch, cfg.env.minibatch_size, cfg.ppo.epochs):
+        losses = agent.loss(minibatch)
+        total = sum(
+            value
+            for name, value in losses.items()
+            if name.startswith("loss_") and not (later and name == "loss_prior_weight")
+        )
+        step(optimizer, groups, total)
+        count += 1
+        for name, value in losses.items():
+            value = value.detach()
+            sums[name] = sums[name] + value if name in sums else value
+    if later and agent.weight is not None:
+        for minibatch in minibatches(batch, cfg.env.minibatch_size, cfg.weight.epochs):
+            step(optimizer, groups, agent.loss(minibatch)["loss_prior_weight"])
+    agent.loss.update_value_offset(batch)  # type: ignore[operator]
+    return {name: value.mean() / count for name, value in sums.items()}
+
+
+def step(optimizer: torch.optim.Optimizer, groups: list[list[nn.Parameter]], loss: Any) -> None:
+    """One step, the gradient clipped for each network apart."""
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    for parameters in groups:
+        nn.utils.clip_grad_norm_(parameters, optimizer.defaults["max_grad_norm"])
+    optimizer.step()
+
+
+def train(cfg: MujocoConfig, run: Run) -> None:
+    """Train to the end, from the last checkpoint if there is one."""
+    torch.manual_seed(cfg.seed)
+    env_id = f"{cfg.env.id}-{cfg.env.version}"
+    env = make_vector_env(env_id, cfg.env.num_envs, **cfg.env.kwargs)
+    test_env = make_vector_env(env_id, cfg.evaluation.episodes, **cfg.env.kwargs)
+    agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
+    rate = {"weight": cfg.ppo.lr * cfg.weight.lr_coeff}
+    optimizer = torch.optim.Adam(
+        [
+            {"params": network.parameters(), "lr": rate.get(name, cfg.ppo.lr)}
+            for name, network in agent.networks().items()
+        ],
+        lr=cfg.ppo.lr,
+        eps=cfg.ppo.adam_eps,
+        fused=True,
+    )
+    optimizer.defaults["max_grad_norm"] = cfg.ppo.max_grad_norm
+    collector = VectorCollector(
+        env,
+        agent.actor,
+        frames_per_batch=cfg.env.frames_per_batch,
+        total_frames=cfg.total_frames,
+        normalizer=agent.normalizer,
+        seed=cfg.seed,
+    )
+    run.register(agent=agent, optimizer=optimizer, collector=collector)
+    start, first = time.perf_counter(), collector.frames
+    for rollout in collector:
+        metrics = optimise(agent, optimizer, agent.prepare(rollout))
+        ended = rollout["next", "done"].squeeze(-1)
+        metrics["episode_return"] = rollout["next", "episode_reward"].squeeze(-1)[ended].mean()
+        metrics["fps"] = torch.tensor((collector.frames - first) / (time.perf_counter() - start))
+        if agent.weight is not None:
+            weight = agent.weight(rollout.select("observation_norm"))["prior_weight"].detach()
+            for quantile in (5, 50, 95):
+                metrics[f"prior_weight_q{quantile:02d}"] = weight.quantile(quantile / 100)
+        run.log(collector.frames, metrics)
+        if run.evaluation_is_due(collector.frames):
+            result = evaluate(
+                test_env,
+                agent.actor,
+                episodes=cfg.evaluation.episodes,
+                normalizer=agent.normalizer,
+                seed=cfg.seed * 1_000_003 + collector.frames,
+            )
+            run.log_evaluation(collector.frames, result)
+        run.checkpoint_if_due(collector.frames)
+    run.finish(agent.actor, agent.normalizer, env_id)
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="mujoco")
+def main(cfg: MujocoConfig) -> None:
+    """Train, or continue training, one agent."""
+    supervise(cfg, check, train)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""What a MuJoCo run may be configured with: names and types here, defaults in ``conf/mujoco.yaml`` and ``conf/env``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from torchrl_priors.methods import get_method
+
+__all__ = ["MujocoConfig", "check"]
+
+
+@dataclass
+class Env:
+    """The task, and what is tuned to it."""
+
+    id: str = MISSING
+    version: str = MISSING
+    num_envs: int = MISSING
+    frames_per_batch: int = MISSING
+    minibatch_size: int = MISSING
+    total_frames: int = MISSING
+    degrade_feature: int = MISSING
+    degrade_threshold: float = MISSING
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class Prior:
+    """The teacher."""
+
+    path: str | None = MISSING
+    degrade: str = MISSING
+    feature: int = MISSING
+    threshold: float = MISSING
+    prob: float = MISSING
+
+
+@dataclass
+class Weight:
+    """The prior weight."""
+
+    lr_coeff: float = MISSING
+    init_bias: float = MISSING
+    trained: str = MISSING
+    epochs: int = MISSING
+
+
+@dataclass
+class PPO:
+    """The base algorithm."""
+
+    epochs: int = MISSING
+    clip_epsilon: float = MISSING
+    lr: float = MISSING
+    adam_eps: float = MISSING
+    gamma: float = MISSING
+    gae_lambda: float = MISSING
+    entropy_coeff: float = MISSING
+    max_grad_norm: float = MISSING
+    hidden: list[int] = MISSING
+
+
+@dataclass
+class Evaluation:
+    """When and how the frozen policy is evaluated."""
+
+    interval: int = MISSING
+    episodes: int = MISSING
+
+
+@dataclass
+class Checkpoints:
+    """What an interruption costs."""
+
+    interval: int = MISSING
+    keep: int = MISSING
+
+
+@dataclass
+class MujocoConfig:
+    """The whole configuration of ``python -m recipes.mujoco``."""
+
+    env: Env = field(default_factory=Env)
+    method: str = MISSING
+    seed: int = MISSING
+    total_frames: int = MISSING
+    prior: Prior = field(default_factory=Prior)
+    weight: Weight = field(default_factory=Weight)
+    td_error: str = MISSING
+    centering: str = MISSING
+    bonus_coeff: float = MISSING
+    aux_coeff: float = MISSING
+    ppo: PPO = field(default_factory=PPO)
+    evaluation: Evaluation = field(default_factory=Evaluation)
+    checkpoint: Checkpoints = field(default_factory=Checkpoints)
+    resume: bool = MISSING
+    logger: str = MISSING
+    out: str | None = MISSING
+
+
+ConfigStore.instance().store(group="schema", name="mujoco", node=MujocoConfig, package="_global_")
+
+
+def _require(holds: bool, key: str, value: Any, expected: str) -> None:
+    if not holds:
+        raise ValueError(f"{key}={value}: expected {expected}.")
+
+
+def check(cfg: MujocoConfig) -> None:
+    """Refuse what would fail or mean nothing later.
+
+    Raises:
+        ValueError: names the key, its value and what was expected.
+    """
+    get_method(cfg.method)
+    if cfg.method != "none":
+        _require(
+            cfg.prior.path is not None,
+            "prior.path",
+            cfg.prior.path,
+            f"the file of a teacher, as method={cfg.method} has one",
+        )
+    options = {
+        "td_error": (cfg.td_error, ("original", "shaped")),
+        "centering": (cfg.centering, ("none", "prior", "policy")),
+        "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
+        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout")),
+        "logger": (cfg.logger, ("csv", "tensorboard", "wandb")),
+    }
+    for key, (choice, allowed) in options.items():
+        _require(choice in allowed, key, choice, f"one of {', '.join(allowed)}")
+    positive = {
+        "total_frames": cfg.total_frames,
+        "env.num_envs": cfg.env.num_envs,
+        "env.frames_per_batch": cfg.env.frames_per_batch,
+        "env.minibatch_size": cfg.env.minibatch_size,
+        "ppo.epochs": cfg.ppo.epochs,
+        "ppo.lr": cfg.ppo.lr,
+        "ppo.clip_epsilon": cfg.ppo.clip_epsilon,
+        "ppo.adam_eps": cfg.ppo.adam_eps,
+        "ppo.max_grad_norm": cfg.ppo.max_grad_norm,
+        "weight.epochs": cfg.weight.epochs,
+        "evaluation.interval": cfg.evaluation.interval,
+        "evaluation.episodes": cfg.evaluation.episodes,
+        "checkpoint.interval": cfg.checkpoint.interval,
+        "checkpoint.keep": cfg.checkpoint.keep,
+    }
+    for key, value in positive.items():
+        _require(0 < value < float("inf"), key, value, "a positive number")
+    at_least_0 = {
+        "seed": cfg.seed,
+        "bonus_coeff": cfg.bonus_coeff,
+        "aux_coeff": cfg.aux_coeff,
+        "weight.lr_coeff": cfg.weight.lr_coeff,
+        "ppo.entropy_coeff": cfg.ppo.entropy_coeff,
+    }
+    for key, value in at_least_0.items():
+        _require(0 <= value < float("inf"), key, value, "a number of at least 0")
+    shares = {"ppo.gamma": cfg.ppo.gamma, "ppo.gae_lambda": cfg.ppo.gae_lambda, "prior.prob": cfg.prior.prob}
+    for key, value in shares.items():
+        _require(0 <= value <= 1, key, value, "a number in [0, 1]")
+    _require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
+    batch, frames = cfg.env.frames_per_batch, cfg.total_frames
+    envs, size = cfg.env.num_envs, cfg.env.minibatch_size
+    _require(batch % envs == 0, "env.frames_per_batch", batch, f"a multiple of env.num_envs={envs}")
+    _require(batch % size == 0, "env.minibatch_size", size, f"a divisor of env.frames_per_batch={batch}")
+    near = max(1, round(frames / batch)) * batch
+    expected = f"a multiple of env.frames_per_batch={batch}, such as {near}"
+    _require(frames % batch == 0, "total_frames", frames, expected)

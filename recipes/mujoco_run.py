@@ -1,0 +1,214 @@
+"""The folder of a MuJoCo run: its tables, checkpoints and status, and what to do when it is broken off or fails."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+import traceback
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+from torch import Tensor
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.record.loggers import get_logger
+from tqdm import tqdm
+
+from recipes.mujoco_config import MujocoConfig
+from recipes.runs import RunFolder, digest
+from torchrl_priors.artifacts import save_policy
+from torchrl_priors.collectors.evaluation import Evaluation
+
+__all__ = ["Run", "TrainingError", "supervise"]
+
+#: What the results do not depend on.
+_INCIDENTAL = ("out", "resume", "logger", "checkpoint")
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the last good checkpoint is kept."""
+
+
+class Run:
+    """A run's folder and schedule.
+
+    ``eval.csv`` and ``metrics.csv`` are written whole with every evaluation and checkpoint. After an interruption the
+    rows that are newer than the checkpoint are dropped: they come again.
+    """
+
+    def __init__(self, cfg: MujocoConfig) -> None:
+        plain: Any = OmegaConf.to_container(cfg, resolve=True)
+        matters = {key: value for key, value in plain.items() if key not in _INCIDENTAL}
+        if cfg.prior.path is not None:
+            matters["prior"] |= {"path": Path(cfg.prior.path).name, "sha256": _sha256(Path(cfg.prior.path))}
+        env = f"{cfg.env.id}-{cfg.env.version}"
+        path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}")
+        self.cfg = cfg
+        self.folder = RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True))
+        self.evaluations: list[dict[str, float]] = []
+        self.metrics: list[dict[str, float]] = []
+        self.rotation = CheckpointRotation(path / "checkpoints", keep_last=cfg.checkpoint.keep)
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """What is known of the run: its state (``running``, ``finished`` or ``failed``), frames, and error if any."""
+        path = self.folder.path / "status.json"
+        return json.loads(path.read_text()) if path.exists() else {"state": "new", "frames": 0}
+
+    def set_status(self, state: str, **more: Any) -> None:
+        """Write ``status.json``."""
+        text = json.dumps({"state": state, **more})
+        self.folder.write("status.json", lambda path: path.write_text(text))
+
+    def register(self, **components: Any) -> None:
+        """What a checkpoint consists of; loads the last one, if the run is to be resumed."""
+        self.frames = 0
+        self.collector = components["collector"]
+        self.checkpoint = Checkpoint(**components, rng=GlobalRNGState())
+        if self.cfg.resume and self.rotation.latest() is not None:
+            self.rotation.load_latest(self.checkpoint)
+            self.frames = self.collector.frames
+            self.evaluations = _rows_until(self.folder.path / "eval.csv", self.frames)
+            self.metrics = _rows_until(self.folder.path / "metrics.csv", self.frames)
+        self.next_evaluation = _next_multiple(self.frames, self.cfg.evaluation.interval)
+        self.next_checkpoint = _next_multiple(self.frames, self.cfg.checkpoint.interval)
+        self.set_status("running", frames=self.frames)
+        self.bar = tqdm(
+            total=self.cfg.total_frames, initial=self.frames, unit="frame", unit_scale=True, disable=_in_sweep()
+        )
+        self.logger = None
+        if self.cfg.logger != "csv":
+            self.logger = get_logger(self.cfg.logger, logger_name=str(self.folder.path), experiment_name="log")
+
+    def log(self, frames: int, metrics: dict[str, Tensor]) -> None:
+        """Keep one rollout's metrics.
+
+        Raises:
+            TrainingError: a loss is not finite.
+        """
+        row = {"frames": float(frames)} | {name: value.item() for name, value in metrics.items()}
+        bad = [name for name, value in row.items() if name.startswith("loss_") and not math.isfinite(value)]
+        if bad:
+            last = self.rotation.latest()
+            raise TrainingError(
+                f"{', '.join(bad)} became NaN or infinite at {frames} frames; the last checkpoint before it is {last}."
+            )
+        self.metrics.append(row)
+        self.bar.update(frames - self.frames)
+        self.frames = frames
+        self._to_logger("train", row)
+
+    def evaluation_is_due(self, frames: int) -> bool:
+        """Whether the policy is to be evaluated now: every ``evaluation.interval`` frames and at the end."""
+        if frames < self.next_evaluation and frames < self.cfg.total_frames:
+            return False
+        self.next_evaluation = _next_multiple(frames, self.cfg.evaluation.interval)
+        return True
+
+    def log_evaluation(self, frames: int, result: Evaluation) -> None:
+        """Keep an evaluation."""
+        returns = result.returns
+        row = {
+            "frames": float(frames),
+            "mean_return": returns.mean().item(),
+            "std_return": returns.std(correction=0).item(),
+            "min_return": returns.min().item(),
+            "max_return": returns.max().item(),
+            "mean_length": result.lengths.double().mean().item(),
+            "episodes": float(len(returns)),
+        }
+        self.evaluations.append(row)
+        self.bar.set_postfix({"return": f"{row['mean_return']:.0f}"})
+        self._to_logger("eval", row)
+        self._write_tables()
+
+    def checkpoint_if_due(self, frames: int) -> None:
+        """Save everything every ``checkpoint.interval`` frames and at the end."""
+        if frames >= self.next_checkpoint or frames >= self.cfg.total_frames:
+            self.next_checkpoint = _next_multiple(frames, self.cfg.checkpoint.interval)
+            self._write_tables()
+            self.rotation.save(self.checkpoint, step=frames)
+            self.set_status("running", frames=frames)
+
+    def finish(self, actor: Any, normalizer: Any, env_id: str) -> None:
+        """Export the policy as a teacher, and say that the run is done."""
+        last = self.evaluations[-1]
+        save_policy(
+            self.folder.path / "policy.safetensors",
+            actor,
+            normalizer,
+            env_id=env_id,
+            seed=self.cfg.seed,
+            frames=self.frames,
+            evaluation=last,
+            training={"method": self.cfg.method, "recipe": "recipes.mujoco"},
+        )
+        self.bar.close()
+        self.set_status("finished", frames=self.frames, mean_return=last["mean_return"])
+        print(f"{self.folder.path}: return {last['mean_return']:.1f} at {self.frames} frames")
+
+    def _write_tables(self) -> None:
+        for name, rows in (("eval", self.evaluations), ("metrics", self.metrics)):
+            table = pd.DataFrame(rows)
+            self.folder.write(f"{name}.csv", partial(table.to_csv, index=False))
+
+    def _to_logger(self, prefix: str, row: dict[str, float]) -> None:
+        if self.logger is not None:
+            for name, value in row.items():
+                if name != "frames" and math.isfinite(value):
+                    self.logger.log_scalar(f"{prefix}/{name}", value, step=int(row["frames"]))
+
+
+def supervise(
+    cfg: MujocoConfig, check: Callable[[MujocoConfig], None], train: Callable[[MujocoConfig, Run], None]
+) -> None:
+    """Check, train, and leave a status whatever happens: in a sweep a broken run does not stop the others."""
+    run = None
+    torch.set_num_threads(1)
+    try:
+        check(cfg)
+        run = Run(cfg)
+        if run.status["state"] == "finished":
+            print(f"{run.folder.path}: finished already")
+            return
+        train(cfg, run)
+    except (ValueError, OSError, RuntimeError, ImportError) as error:
+        expected = isinstance(error, (ValueError, OSError, ImportError, TrainingError))
+        if run is not None:
+            run.set_status("failed", frames=getattr(run, "frames", 0), error=str(error))
+        if not expected:
+            traceback.print_exc()
+        message = f"Error: {error}"
+        if _in_sweep():
+            print(message, file=sys.stderr)
+            return
+        sys.exit(message)
+
+
+def _in_sweep() -> bool:
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def _next_multiple(frames: int, interval: int) -> int:
+    return (frames // interval + 1) * interval
+
+
+def _rows_until(path: Path, frames: int) -> list[dict[str, float]]:
+    if not path.exists():
+        return []
+    rows = pd.read_csv(path, float_precision="round_trip").to_dict("records")
+    return [row for row in rows if row["frames"] <= frames]
+
+
+def _sha256(path: Path) -> str:
+    if not path.is_file():
+        raise FileNotFoundError(f"prior.path={path}: no such file.")
+    return hashlib.sha256(path.read_bytes()).hexdigest()
