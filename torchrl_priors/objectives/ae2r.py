@@ -17,13 +17,15 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch import distributions as d
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from torchrl_priors.functional import alignment, prior_bonus, prior_weight_loss, td_residual
 from torchrl_priors.methods import MethodSpec, get_method
+from torchrl_priors.priors import ActionPrior
 
-from .cross_entropy import cross_entropy, kl_divergence
+from .cross_entropy import cross_entropy_and_kl
 
 __all__ = ["AE2RLoss"]
 
@@ -84,6 +86,9 @@ class AE2RLoss(LossModule):
             :func:`~torchrl_priors.cross_entropy`. Defaults to ``None``.
         reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"``. Defaults to ``"mean"``.
         loss_critic_type (str): ``"l1"``, ``"l2"`` or ``"smooth_l1"``. Defaults to ``"l2"``.
+        prior_in_batch (bool): read the parameters of the prior's distribution from the batch instead of running the
+            prior, where ``PriorLogProb(prior, ..., keep_params=True)`` left them: once a rollout, not once a minibatch.
+            It needs an :class:`~torchrl_priors.ActionPrior`. Defaults to ``False``.
         functional (bool): whether the networks are functionalised, as in TorchRL's losses. Defaults to ``True``.
 
     The batch must hold ``prior_log_prob`` or ``("next", "prior_log_prob")``, ``[*B, 1]``, as
@@ -190,6 +195,7 @@ class AE2RLoss(LossModule):
         num_samples: int | None = None,
         reduction: Literal["none", "mean", "sum"] | None = None,
         loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
+        prior_in_batch: bool = False,
         functional: bool = True,
     ):
         spec = get_method(method) if isinstance(method, str) else method
@@ -198,6 +204,8 @@ class AE2RLoss(LossModule):
         _check_option("weight_target", weight_target, ("td", "advantage"))
         _check_option("centering", centering, ("none", "prior", "policy"))
         _check_option("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
+        if prior_in_batch and not isinstance(prior, ActionPrior):
+            raise ValueError(f"prior_in_batch=True needs an ActionPrior as prior, got {type(prior).__name__}.")
         if not 0.0 <= gamma <= 1.0:
             raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
         if spec.adaptive:
@@ -236,6 +244,7 @@ class AE2RLoss(LossModule):
 
         self._set_network("actor_network", actor_network)
         self.prior = prior
+        self.prior_in_batch = prior_in_batch
         student = list(actor_network.parameters())
         self._set_network("prior_weight", prior_weight if spec.adaptive else None, apart_from=student)
         self._set_network("critic_network", critic_network if spec.adaptive else None, apart_from=student)
@@ -280,7 +289,11 @@ class AE2RLoss(LossModule):
             keys: list[NestedKey] = []
             names = self.tensor_keys
             if self._needs_cross_entropy:
-                keys += [*self.actor_network.in_keys, *self.prior.in_keys, *getattr(self.prior, "draw_keys", ())]
+                keys += self.actor_network.in_keys
+                if self.prior_in_batch:
+                    keys += self.prior.out_keys
+                else:
+                    keys += [*self.prior.in_keys, *getattr(self.prior, "draw_keys", ())]
             if self.spec.adaptive:
                 shifted = self.weight_target == "td" and self.spec.bonus == "next"
                 keys += self.prior_weight.in_keys if self.spec.auxiliary or not shifted else []
@@ -324,12 +337,16 @@ class AE2RLoss(LossModule):
     @dispatch(auto_batch_size=False)  # no guess from the shapes: a single observation has no trailing 1 to tell by
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch of any batch size, and what is worth logging; the batch is left as it is."""
+        return self._losses(tensordict)
+
+    def _losses(self, tensordict: TensorDictBase, dist: d.Distribution | None = None) -> TensorDictBase:
+        """See :meth:`forward`; ``dist`` is the student's, if it is at hand."""
         losses: dict[str, Tensor] = {}
         logs: dict[str, Tensor] = {}
         weight: Tensor | None = None
         entropy: Tensor | None = None
         if self._needs_cross_entropy:
-            entropy, logs["prior_kl"] = self._cross_entropy(tensordict)
+            entropy, logs["prior_kl"] = self._cross_entropy(tensordict, dist)
             logs["prior_cross_entropy"] = entropy
         if self.spec.adaptive:
             delta: Tensor | None = None
@@ -350,24 +367,36 @@ class AE2RLoss(LossModule):
         if bonus is not None:
             logs["prior_bonus"] = bonus
 
-        out = TensorDict({})
-        for name, value in losses.items():
-            out.set(name, self._reduce_loss(value, tensordict).squeeze(-1))
+        masked = any(tensordict.get(key, None) is not None for key in self._loss_mask_keys())
+        steps = tensordict if masked else None
+        reduced = {name: self._reduce_loss(value, steps).squeeze(-1) for name, value in losses.items()}
         for name, value in logs.items():
-            out.set(name, self._reduce_loss(value.detach(), tensordict, reduction="mean"))
+            reduced[name] = self._reduce_loss(value.detach(), steps, reduction="mean")
+        out = TensorDict(reduced)
         self._clear_weakrefs(tensordict, out, "actor_network_params", "prior_weight_params", "critic_network_params")
         return out
 
-    def _cross_entropy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _cross_entropy(self, tensordict: TensorDictBase, dist: d.Distribution | None) -> tuple[Tensor, Tensor]:
         """H^X(pi || pi0), ``[*B, 1]``, with a gradient for the actor if it is a loss, and KL(pi || pi0) without one."""
         with torch.no_grad():
-            prior_dist = self.prior.get_dist(tensordict.copy())
-        with contextlib.nullcontext() if self.spec.auxiliary else torch.no_grad(), self._params_of("actor_network"):
-            dist = self.actor_network.get_dist(tensordict.copy())
-            entropy = cross_entropy(dist, prior_dist, num_samples=self.num_samples)
-        with torch.no_grad():
-            kl = kl_divergence(dist, prior_dist, num_samples=self.num_samples)
+            prior_dist = self._prior_dist(tensordict)
+        with contextlib.nullcontext() if self.spec.auxiliary else torch.no_grad():
+            if dist is None:
+                with self._params_of("actor_network"):
+                    dist = self.actor_network.get_dist(tensordict.copy())
+            entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=self.num_samples)
         return entropy.unsqueeze(-1), kl.unsqueeze(-1)
+
+    def _prior_dist(self, tensordict: TensorDictBase) -> d.Distribution:
+        if not self.prior_in_batch:
+            return self.prior.get_dist(tensordict.copy())
+        params = [tensordict.get(key, None) for key in self.prior.out_keys]
+        if any(value is None for value in params):
+            raise KeyError(
+                f"prior_in_batch=True, but the batch lacks some of {self.prior.out_keys}, the parameters of the prior's"
+                " distribution: run PriorLogProb(prior, ..., keep_params=True) on it before the loss."
+            )
+        return self.prior.build_dist(dict(zip(self.prior.param_names, params, strict=True)))
 
     def _td_error(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """The TD error on raw rewards, detached, and the elementwise loss of the raw critic if it is trained here."""
@@ -378,10 +407,10 @@ class AE2RLoss(LossModule):
             value = self._evaluate("critic_network", tensordict, self.tensor_keys.value)
         with torch.no_grad():
             next_value = self._evaluate("critic_network", tensordict.get("next"), self.tensor_keys.value)
-            delta = td_residual(value, reward, next_value, terminated, self.gamma)
+            target = td_residual(torch.zeros_like(next_value), reward, next_value, terminated, self.gamma)
+            delta = target - value
         if not self._trains_critic:
             return delta, None
-        target = td_residual(torch.zeros_like(next_value), reward, next_value, terminated, self.gamma)
         return delta, distance_loss(target, value, loss_function=self.loss_critic_type)
 
     def _regress_on_advantage(

@@ -56,8 +56,9 @@ class AVECMixin:
 
     With :math:`m` the mean of :math:`f - \hat V` over the minibatch, the critic regresses on :math:`\hat V + m` instead
     of :math:`\hat V`: its loss is the (biased) variance and its gradient that of the variance, in which the derivative
-    of :math:`m` drops out. Steps that the loss masks out (``loss_mask_key``) do not count in :math:`m`. Only the public
-    ``loss_critic`` is overridden, at the price of a second forward pass of the critic, without gradient.
+    of :math:`m` drops out. Steps that the loss masks out (``loss_mask_key``) do not count in :math:`m`. PPO has a hook
+    through which :math:`m` comes from the values that the loss computes anyway; elsewhere it costs a second forward
+    pass of the critic, without gradient.
 
     The variance leaves :math:`f` free up to a constant, which would enter every bootstrapped target and TD error: end
     the critic with a :class:`ValueOffset` and, after the epochs on a rollout, call :meth:`update_value_offset`.
@@ -99,6 +100,8 @@ class AVECMixin:
 
     """
 
+    _steps: TensorDictBase | None = None  # those of the minibatch, during a forward pass
+
     def __init__(self, *args: Any, loss_critic_type: str = "l2", **kwargs: Any) -> None:
         if loss_critic_type != "l2":
             raise ValueError(f"AVEC is the variance of the l2 critic loss, got loss_critic_type={loss_critic_type!r}.")
@@ -106,11 +109,23 @@ class AVECMixin:
 
     def loss_critic(self: Any, tensordict: TensorDictBase) -> Any:
         """The critic loss of the parent, on targets moved by the mean residual of the minibatch."""
+        if hasattr(super(), "_critic_loss_inputs"):
+            self._steps = tensordict
+            try:
+                return super().loss_critic(tensordict)  # type: ignore[misc]
+            finally:
+                self._steps = None
         key = self.tensor_keys.value_target
         target = tensordict.get(key, None)
         if target is not None:  # else the parent says what is missing
             tensordict = tensordict.copy().set(key, target - self._mean_error(tensordict))
         return super().loss_critic(tensordict)  # type: ignore[misc]
+
+    def _critic_loss_inputs(self: Any, target: Tensor, value: Tensor, old_value: Tensor | None) -> Any:
+        """PPO's hook: the target moved by the mean residual of the minibatch."""
+        target, value, old_value = super()._critic_loss_inputs(target, value, old_value)  # type: ignore[misc]
+        error = (target - value).detach()
+        return target - self._reduce_loss(error, self._steps, reduction="mean"), value, old_value
 
     @torch.no_grad()
     def update_value_offset(self: Any, tensordict: TensorDictBase) -> Tensor:

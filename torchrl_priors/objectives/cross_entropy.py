@@ -106,6 +106,17 @@ def kl_divergence(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
     return (log_prob - prior_dist.log_prob(action)).mean(0)
 
 
+def cross_entropy_and_kl(
+    dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """Both of the above, the divergence without a gradient, for the price of one where there is a closed form."""
+    value = cross_entropy(dist, prior_dist, num_samples=num_samples)
+    with torch.no_grad():
+        if has_analytic_cross_entropy(dist, prior_dist) and has_analytic_entropy(dist):
+            return value, value.detach() - dist.entropy()
+        return value, kl_divergence(dist, prior_dist, num_samples=num_samples)
+
+
 def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | None:
     """The exact cross-entropy of the pair, or ``None``."""
     if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
+from torch import distributions as d
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_priors.methods import MethodSpec
@@ -42,8 +43,8 @@ class ClipPPOPriorLoss(ClipPPOLoss):
             by the adaptive methods with ``td_error="original"``. With ``"shaped"``, ``critic_network`` is in its place.
 
     Keyword Args:
-        method, td_error, weight_target, centering, bonus_coeff, aux_coeff, weight_coeff, num_samples: as for
-            :class:`AE2RLoss`. To schedule a coefficient, assign it on ``prior_loss``:
+        method, td_error, weight_target, centering, bonus_coeff, aux_coeff, weight_coeff, num_samples, prior_in_batch:
+            as for :class:`AE2RLoss`. To schedule a coefficient, assign it on ``prior_loss``:
             ``loss.prior_loss.aux_coeff = 0.5``.
         prior_critic_coeff (float): coefficient of ``loss_prior_critic``. Defaults to 1.0.
         gamma (float): discount, of the prior weight's loss and of the value estimator
@@ -108,6 +109,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
     prior_loss: AE2RLoss
     _in_keys: list[NestedKey] | None
     _out_keys: list[NestedKey] | None
+    _student: d.Distribution | None = None  # during a forward pass
 
     def __init__(
         self,
@@ -127,6 +129,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
         prior_critic_coeff: float = 1.0,
         gamma: float = 0.99,
         num_samples: int | None = None,
+        prior_in_batch: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
         functional: bool = True,
         **kwargs: Any,
@@ -147,6 +150,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
             critic_coeff=prior_critic_coeff,
             gamma=gamma,
             num_samples=num_samples,
+            prior_in_batch=prior_in_batch,
             reduction=reduction,
             functional=functional,
         )
@@ -221,8 +225,18 @@ class ClipPPOPriorLoss(ClipPPOLoss):
             self.prior_loss.reduction = self.reduction
         if self.prior_loss.loss_mask_key != self.loss_mask_key:
             self.prior_loss.loss_mask_key = self.loss_mask_key
-        out = super().forward(tensordict)
-        return out.update(self.prior_loss(tensordict))
+        try:
+            out = super().forward(tensordict)
+            return out.update(self.prior_loss._losses(tensordict, self._student))
+        finally:
+            self._student = None
+
+    def _get_cur_log_prob(self, tensordict: TensorDictBase, params: Any = None) -> Any:
+        """Keeps the student's distribution for the prior's losses, which need it too."""
+        out = super()._get_cur_log_prob(tensordict, params)
+        if params is None:  # else it is that of the delayed parameters
+            self._student = out[1]
+        return out
 
     def reset_parameters_recursive(self) -> None:
         """Reset the networks that this loss trains; never the prior."""

@@ -49,6 +49,9 @@ class PriorLogProb(BatchTransform):
             action drawn from the student; ``"zero"`` is no advice.
         centering ("none", "prior" or "policy"): what else is written, to centre the bonus: :math:`H(\pi_0)`, or
             :math:`H^X(\pi\|\pi_0)`, of each state and of the next one, by the same rules. Defaults to ``"none"``.
+        keep_params (bool): also leave the parameters of the prior's distribution at each step in the batch, under
+            ``prior.out_keys``, e.g. ``("prior", "loc")``: losses with ``prior_in_batch=True`` need not run the prior
+            again. They are right as long as the observations in the batch are not changed. Defaults to ``False``.
         num_samples (int, optional): for a cross-entropy without a closed form. Defaults to ``None``: 1.
         out_keys (list of NestedKey, optional): defaults to ``["prior_log_prob"]``, with centring
             ``["prior_log_prob", "prior_center"]``; each is written ``[*B, T, 1]`` in nats, and under ``"next"`` too.
@@ -95,6 +98,7 @@ class PriorLogProb(BatchTransform):
         time_dim: int | None = None,
         boundary: _Boundary = "expected",
         centering: _Centering = "none",
+        keep_params: bool = False,
         num_samples: int | None = None,
         out_keys: list[NestedKey] | None = None,
         done_key: NestedKey = "done",
@@ -120,6 +124,7 @@ class PriorLogProb(BatchTransform):
         self.time_dim = time_dim
         self.boundary = boundary
         self.centering = centering
+        self.keep_params = keep_params
         self.num_samples = num_samples
         self.done_key = under_next(done_key)
         self.terminated_key = under_next(terminated_key)
@@ -133,7 +138,11 @@ class PriorLogProb(BatchTransform):
         terminated, has_next, wanted = self._boundaries(tensordict, time_dim)
         self._draw(tensordict, has_next, time_dim)
 
-        dist = self.prior.get_dist(tensordict)
+        params = self.prior.get_params(tensordict)
+        dist = self.prior.build_dist(params)
+        if self.keep_params:
+            for key, name in zip(self.prior.out_keys, self.prior.param_names, strict=True):
+                tensordict.set(key, params[name])
         values = [self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)]
         if self.centering != "none":
             policy = self._student(tensordict) if self.centering == "policy" else None
