@@ -1,0 +1,189 @@
+"""The MuJoCo recipe as a user runs it: every method, bad input, interruptions."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+pytest.importorskip("mujoco")
+from recipes import mujoco as recipe
+from recipes.mujoco_config import check
+from recipes.mujoco_run import supervise
+from torchrl_priors.methods import METHODS
+
+ROOT = Path(__file__).parents[1]
+TINY = [
+    "env.num_envs=2",
+    "env.frames_per_batch=64",
+    "env.minibatch_size=32",
+    "total_frames=256",
+    "ppo.epochs=2",
+    "ppo.hidden=[8]",
+    "evaluation.interval=64",
+    "evaluation.episodes=2",
+    "checkpoint.interval=64",
+]
+
+
+def config(out: Path, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("mujoco", overrides=[*TINY, f"out={out}", *overrides])
+
+
+def run(out: Path, *overrides: str) -> Path:
+    supervise(config(out, *overrides), check, recipe.train)
+    return out
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory) -> Path:
+    return run(tmp_path_factory.mktemp("teacher")) / "policy.safetensors"
+
+
+@pytest.mark.parametrize("td_error", ["original", "shaped"])
+@pytest.mark.parametrize("method", [method for method in METHODS if method != "none"])
+def test_every_method_trains_from_a_teacher_that_the_recipe_made(method, td_error, teacher, tmp_path):
+    out = run(tmp_path, f"method={method}", f"prior.path={teacher}", f"td_error={td_error}", "total_frames=128")
+    assert len(pd.read_csv(out / "eval.csv")) == 2
+    metrics = pd.read_csv(out / "metrics.csv")
+    assert ("loss_prior" in metrics) == METHODS[method].auxiliary
+    assert ("loss_prior_weight" in metrics) == METHODS[method].adaptive
+    assert metrics.filter(like="loss_").notna().all(axis=None)
+    assert (out / "policy.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [["prior.degrade=structural"], ["prior.degrade=random"], ["weight.trained=rollout"]]
+)
+def test_degraded_teachers_and_late_weights_run(options, teacher, tmp_path):
+    out = run(tmp_path, "method=ae2r", f"prior.path={teacher}", "total_frames=128", *options)
+    assert pd.read_csv(out / "metrics.csv")["prior_weight"].between(0, 1).all()
+
+
+def test_a_weight_trained_after_the_rollout_is_the_only_thing_trained_then(teacher, tmp_path):
+    cfg = config(tmp_path, "method=ae2r", f"prior.path={teacher}", "weight.trained=rollout", "weight.lr_coeff=0")
+    torch.manual_seed(0)
+    agent = recipe.Agent(cfg, "Hopper-v5", 11, 3)
+    assert set(agent.networks()) == {"actor", "critic", "weight", "raw_critic"}
+
+
+class Interrupted(BaseException):
+    """Stands for a kill between two rollouts."""
+
+
+@pytest.mark.parametrize("method", ["none", "ae2r"])
+def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(method, teacher, tmp_path, monkeypatch):
+    options = [f"method={method}", "checkpoint.interval=128"]
+    options += [] if method == "none" else [f"prior.path={teacher}", "prior.degrade=random"]
+    whole = run(tmp_path / "whole", *options)
+    for stop in (128, 192):
+        out, log = tmp_path / f"stopped-{stop}", recipe.Run.log
+
+        def stopping(self, frames, metrics, log=log, stop=stop):
+            log(self, frames, metrics)
+            if frames == stop:
+                raise Interrupted
+
+        with monkeypatch.context() as patch:
+            patch.setattr(recipe.Run, "log", stopping)
+            with pytest.raises(Interrupted):
+                run(out, *options)
+        run(out, *options)
+        assert (out / "eval.csv").read_bytes() == (whole / "eval.csv").read_bytes()
+        assert (out / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()
+
+
+def test_a_killed_process_continues_where_it_was(tmp_path):
+    def start(out: Path) -> subprocess.Popen:
+        command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    assert start(tmp_path / "whole").wait() == 0
+    out, chance = tmp_path / "killed", random.Random(0)
+    process = start(out)
+    while not (out / "checkpoints").exists() and process.poll() is None:
+        time.sleep(0.05)
+    time.sleep(chance.uniform(0, 0.5))
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert start(out).wait() == 0
+    assert (out / "eval.csv").read_bytes() == (tmp_path / "whole" / "eval.csv").read_bytes()
+
+
+def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
+    monkeypatch.setattr(recipe, "Agent", None)  # would fail if it were
+    run(teacher.parent)
+    assert "finished already" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("method=foo", "Unknown method 'foo'"),
+        ("method=ae2r", "prior.path=None"),
+        ("total_frames=100", "total_frames=100: expected a multiple of env.frames_per_batch=64"),
+        ("env.minibatch_size=48", "env.minibatch_size=48"),
+        ("td_error=both", "td_error=both"),
+        ("ppo.lr=-1", "ppo.lr=-1"),
+        ("prior.prob=2", "prior.prob=2"),
+    ],
+)
+def test_bad_input_is_refused_by_name_before_anything_is_written(override, message, tmp_path):
+    with pytest.raises(SystemExit, match=r"^Error") as error:
+        run(tmp_path / "out", override)
+    assert message in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path):
+    foreign = tmp_path / "foreign.safetensors"
+    foreign.write_bytes(b"not a teacher")
+    for path, env, message in (
+        (tmp_path / "absent.safetensors", "hopper", "no such file"),
+        (foreign, "hopper", "foreign.safetensors"),
+        (teacher, "walker2d", "Hopper-v5"),
+    ):
+        out = tmp_path / f"{path.stem}-{env}"
+        with pytest.raises(SystemExit) as error:
+            run(out, f"env={env}", "method=e2r", f"prior.path={path}", "total_frames=256")
+        assert message in str(error.value)
+
+
+def test_nan_losses_stop_the_run_and_keep_the_last_checkpoint(tmp_path, monkeypatch):
+    def broken(agent, optimizer, rollout, optimise=recipe.optimise, calls=[]):  # noqa: B006
+        calls.append(None)
+        losses = optimise(agent, optimizer, rollout)
+        return losses | {"loss_objective": torch.tensor(float("nan"))} if len(calls) == 3 else losses
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe, "optimise", broken)
+        with pytest.raises(SystemExit, match="loss_objective became NaN") as error:
+            run(tmp_path)
+    assert "128" in str(error.value).rsplit("checkpoint", 1)[1]
+    assert '"failed"' in (tmp_path / "status.json").read_text()
+    run(tmp_path)  # the cause gone, it goes on from there
+    assert pd.read_csv(tmp_path / "eval.csv")["frames"].tolist() == [64, 128, 192, 256]
+
+
+def test_a_sweep_runs_every_combination_although_one_is_broken(tmp_path):
+    command = [sys.executable, "-m", "recipes.mujoco", "-m", "hydra/launcher=basic", *TINY, "total_frames=64"]
+    command += [
+        f"out={tmp_path}/${{method}}-${{seed}}",
+        "method=none,e2r",
+        "seed=0,1",
+        f"hydra.sweep.dir={tmp_path}/sweep",
+    ]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "COLUMNS": "200"})
+    assert result.stderr.count("Error: prior.path=None") == 2, result.stderr
+    assert {path.parent.name for path in tmp_path.glob("*/policy.safetensors")} == {"none-0", "none-1"}
