@@ -94,7 +94,7 @@ class Run:
         Raises:
             TrainingError: a loss is not finite.
         """
-        row = {"frames": float(frames)} | {name: value.item() for name, value in metrics.items()}
+        row = {"frames": frames} | {name: value.item() for name, value in metrics.items()}
         bad = [name for name, value in row.items() if name.startswith("loss_") and not math.isfinite(value)]
         if bad:
             last = self.rotation.latest()
@@ -117,13 +117,13 @@ class Run:
         """Keep an evaluation."""
         returns = result.returns
         row = {
-            "frames": float(frames),
+            "frames": frames,
             "mean_return": returns.mean().item(),
             "std_return": returns.std(correction=0).item(),
             "min_return": returns.min().item(),
             "max_return": returns.max().item(),
             "mean_length": result.lengths.double().mean().item(),
-            "episodes": float(len(returns)),
+            "episodes": len(returns),
         }
         self.evaluations.append(row)
         self.bar.set_postfix({"return": f"{row['mean_return']:.0f}"})

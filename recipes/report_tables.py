@@ -220,7 +220,7 @@ def dynamics_table(study: Study) -> pd.DataFrame:
             gap = (
                 (values - reference[metric].reindex(values.index)).dropna()
                 if reference is not None and metric in reference and label != study.cfg.baseline
-                else values[:0]
+                else values.iloc[:0]
             )
             if len(values):
                 spread = (float(values.std(ddof=0)), gap.mean(), gap.std(ddof=0))
