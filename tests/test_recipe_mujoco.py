@@ -18,6 +18,7 @@ from omegaconf import DictConfig
 
 pytest.importorskip("mujoco")
 from recipes import mujoco as recipe
+from recipes.export_best import ExportConfig, export
 from recipes.mujoco_config import check
 from recipes.mujoco_run import supervise
 from torchrl_priors.methods import METHODS
@@ -187,3 +188,16 @@ def test_a_sweep_runs_every_combination_although_one_is_broken(tmp_path):
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "COLUMNS": "200"})
     assert result.stderr.count("Error: prior.path=None") == 2, result.stderr
     assert {path.parent.name for path in tmp_path.glob("*/policy.safetensors")} == {"none-0", "none-1"}
+
+
+def test_the_best_baseline_over_seeds_becomes_the_teacher(teacher, tmp_path):
+    out = run(tmp_path / "other", "seed=1", "total_frames=128")
+    best = tmp_path / "best.safetensors"
+    cfg = ExportConfig([str(teacher.parent), str(out)], "Hopper-v5", str(best), "none")
+    export(cfg)
+    returns = {folder: pd.read_csv(folder / "eval.csv")["mean_return"].iloc[-1] for folder in (teacher.parent, out)}
+    winner = max(returns, key=returns.__getitem__)
+    assert best.read_bytes() == (winner / "policy.safetensors").read_bytes()
+    cfg.env_id = "Ant-v5"
+    with pytest.raises(ValueError, match="No finished run of method=none on env_id=Ant-v5"):
+        export(cfg)
