@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .ae2r import AE2RLoss
 from .avec import AVECMixin, ValueOffset
+from .compiled_step import CompiledStep
 from .cross_entropy import cross_entropy, has_analytic_cross_entropy, kl_divergence
 from .ppo import ClipPPOPriorLoss
 
@@ -11,6 +12,7 @@ __all__ = [
     "AE2RLoss",
     "AVECMixin",
     "ClipPPOPriorLoss",
+    "CompiledStep",
     "ValueOffset",
     "cross_entropy",
     "has_analytic_cross_entropy",
