@@ -37,6 +37,7 @@ from torchrl_priors import (
 from torchrl_priors.artifacts import load_prior
 from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate, make_vector_env
 from torchrl_priors.networks import make_actor, make_critic, make_prior_weight
+from torchrl_priors.objectives import CompiledStep
 
 
 class AVECClipPPOLoss(AVECMixin, ClipPPOLoss):
@@ -92,7 +93,7 @@ class Agent(nn.Module):
             self.weight = make_prior_weight(obs_dim, hidden, init_bias=cfg.weight.init_bias)
             if cfg.td_error == "original" and spec.weight_target == "td":
                 self.raw_critic = make_critic(obs_dim, hidden)
-        self.transforms.append(PriorLogProb(prior, self.actor, centering=options["centering"]))
+        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=options["centering"]))
         if spec.bonus != "none":
             self.transforms.append(PriorBonus.from_method(cfg.method, self.weight, **options))
             self.advantage.set_keys(reward="shaped_reward")
@@ -106,6 +107,7 @@ class Agent(nn.Module):
             method=cfg.method,
             aux_coeff=cfg.aux_coeff,
             gamma=cfg.ppo.gamma,
+            prior_in_batch=True,
             **options,
             **ppo,
         )
@@ -130,46 +132,43 @@ class Agent(nn.Module):
         return rollout.select(*read, strict=False)
 
 
-def minibatches(batch: TensorDictBase, size: int, epochs: int) -> Iterator[TensorDictBase]:
-    """Random minibatches of the flat batch, every step once per epoch."""
-    for _ in range(epochs):
-        for chosen in torch.randperm(len(batch)).split(size):
-            yield batch[chosen]
+class Optimiser:
+    """The epochs on a rollout."""
 
-
-def optimise(agent: Agent, optimizer: torch.optim.Optimizer, rollout: TensorDictBase) -> dict[str, Tensor]:
-    """The epochs on one rollout; the mean of everything that the loss reports."""
-    cfg, batch = agent.cfg, rollout.reshape(-1)
-    groups = [list(network.parameters()) for network in agent.networks().values()]
-    later = cfg.weight.trained == "rollout"
-    sums: dict[str, Tensor] = {}
-    count = 0
-    for minibatch in minibatches(batch, cfg.env.minibatch_size, cfg.ppo.epochs):
-        losses = agent.loss(minibatch)
-        total = sum(
-            value
-            for name, value in losses.items()
-            if name.startswith("loss_") and not (later and name == "loss_prior_weight")
+    def __init__(self, agent: Agent) -> None:
+        cfg = agent.cfg
+        rate = {"weight": cfg.ppo.lr * cfg.weight.lr_coeff}
+        # a group for each network: its gradient is clipped apart
+        groups = [
+            {"params": list(network.parameters()), "lr": rate.get(name, cfg.ppo.lr)}
+            for name, network in agent.networks().items()
+        ]
+        self.agent = agent
+        self.adam = torch.optim.Adam(groups, lr=cfg.ppo.lr, eps=cfg.ppo.adam_eps, fused=True)
+        options: dict[str, Any] = {
+            "max_grad_norm": cfg.ppo.max_grad_norm,
+            "backend": "inductor" if cfg.compile else "eager",
+        }
+        later = {"loss_prior_weight"} if cfg.weight.trained == "rollout" else set()
+        self.step = CompiledStep(
+            agent.loss, self.adam, select=lambda name: name.startswith("loss_") and name not in later, **options
         )
-        step(optimizer, groups, total)
-        count += 1
-        for name, value in losses.items():
-            value = value.detach()
-            sums[name] = sums[name] + value if name in sums else value
-    if later and agent.weight is not None:
-        for minibatch in minibatches(batch, cfg.env.minibatch_size, cfg.weight.epochs):
-            step(optimizer, groups, agent.loss(minibatch)["loss_prior_weight"])
-    agent.loss.update_value_offset(batch)  # type: ignore[operator]
-    return {name: value.mean() / count for name, value in sums.items()}
+        self.weight_step = CompiledStep(agent.loss, self.adam, select=later.__contains__, **options) if later else None
+
+    def __call__(self, rollout: TensorDictBase) -> dict[str, Tensor]:
+        """Train on a prepared rollout; the mean of everything that the loss reports."""
+        cfg, batch = self.agent.cfg, rollout.reshape(-1)
+        report = self.step(batch, minibatches(len(batch), cfg.env.minibatch_size, cfg.ppo.epochs)).mean(0)
+        if self.weight_step is not None and self.agent.weight is not None:
+            self.weight_step(batch, minibatches(len(batch), cfg.env.minibatch_size, cfg.weight.epochs))
+        self.agent.loss.update_value_offset(batch)  # type: ignore[operator]
+        return dict(zip(self.step.names, report, strict=True))
 
 
-def step(optimizer: torch.optim.Optimizer, groups: list[list[nn.Parameter]], loss: Any) -> None:
-    """One step, the gradient clipped for each network apart."""
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    for parameters in groups:
-        nn.utils.clip_grad_norm_(parameters, optimizer.defaults["max_grad_norm"])
-    optimizer.step()
+def minibatches(frames: int, size: int, epochs: int) -> Iterator[Tensor]:
+    """The indices of random minibatches, every frame once per epoch."""
+    for _ in range(epochs):
+        yield from torch.randperm(frames).split(size)
 
 
 def train(cfg: MujocoConfig, run: Run) -> None:
@@ -179,17 +178,7 @@ def train(cfg: MujocoConfig, run: Run) -> None:
     env = make_vector_env(env_id, cfg.env.num_envs, **cfg.env.kwargs)
     test_env = make_vector_env(env_id, cfg.evaluation.episodes, **cfg.env.kwargs)
     agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
-    rate = {"weight": cfg.ppo.lr * cfg.weight.lr_coeff}
-    optimizer = torch.optim.Adam(
-        [
-            {"params": network.parameters(), "lr": rate.get(name, cfg.ppo.lr)}
-            for name, network in agent.networks().items()
-        ],
-        lr=cfg.ppo.lr,
-        eps=cfg.ppo.adam_eps,
-        fused=True,
-    )
-    optimizer.defaults["max_grad_norm"] = cfg.ppo.max_grad_norm
+    optimise = Optimiser(agent)
     collector = VectorCollector(
         env,
         agent.actor,
@@ -198,10 +187,10 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         normalizer=agent.normalizer,
         seed=cfg.seed,
     )
-    run.register(agent=agent, optimizer=optimizer, collector=collector)
+    run.register(agent=agent, optimizer=optimise.adam, collector=collector)
     start, first = time.perf_counter(), collector.frames
     for rollout in collector:
-        metrics = optimise(agent, optimizer, agent.prepare(rollout))
+        metrics = optimise(agent.prepare(rollout))
         ended = rollout["next", "done"].squeeze(-1)
         metrics["episode_return"] = rollout["next", "episode_reward"].squeeze(-1)[ended].mean()
         metrics["fps"] = torch.tensor((collector.frames - first) / (time.perf_counter() - start))

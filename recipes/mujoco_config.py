@@ -97,6 +97,7 @@ class MujocoConfig:
     ppo: PPO = field(default_factory=PPO)
     evaluation: Evaluation = field(default_factory=Evaluation)
     checkpoint: Checkpoints = field(default_factory=Checkpoints)
+    compile: bool = MISSING
     resume: bool = MISSING
     logger: str = MISSING
     out: str | None = MISSING

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,6 +35,7 @@ TINY = [
     "evaluation.interval=64",
     "evaluation.episodes=2",
     "checkpoint.interval=64",
+    "compile=false",
 ]
 
 
@@ -83,9 +85,13 @@ class Interrupted(BaseException):
     """Stands for a kill between two rollouts."""
 
 
-@pytest.mark.parametrize("method", ["none", "ae2r"])
-def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(method, teacher, tmp_path, monkeypatch):
-    options = [f"method={method}", "checkpoint.interval=128"]
+@pytest.mark.parametrize(("method", "compiled"), [("none", False), ("ae2r", False), ("ae2r", True)])
+def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
+    method, compiled, teacher, tmp_path, monkeypatch
+):
+    if compiled and shutil.which("g++") is None and shutil.which("clang++") is None:
+        pytest.skip("no C++ compiler")
+    options = [f"method={method}", "checkpoint.interval=128", f"compile={compiled}"]
     options += [] if method == "none" else [f"prior.path={teacher}", "prior.degrade=random"]
     whole = run(tmp_path / "whole", *options)
     for stop in (128, 192):
@@ -162,13 +168,13 @@ def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path)
 
 
 def test_nan_losses_stop_the_run_and_keep_the_last_checkpoint(tmp_path, monkeypatch):
-    def broken(agent, optimizer, rollout, optimise=recipe.optimise, calls=[]):  # noqa: B006
+    def broken(self, rollout, optimise=recipe.Optimiser.__call__, calls=[]):  # noqa: B006
         calls.append(None)
-        losses = optimise(agent, optimizer, rollout)
+        losses = optimise(self, rollout)
         return losses | {"loss_objective": torch.tensor(float("nan"))} if len(calls) == 3 else losses
 
     with monkeypatch.context() as patch:
-        patch.setattr(recipe, "optimise", broken)
+        patch.setattr(recipe.Optimiser, "__call__", broken)
         with pytest.raises(SystemExit, match="loss_objective became NaN") as error:
             run(tmp_path)
     assert "128" in str(error.value).rsplit("checkpoint", 1)[1]
