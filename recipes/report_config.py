@@ -8,6 +8,8 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
+from recipes.checks import refuse_unknown_keys
+
 __all__ = ["Bootstrap", "ReportConfig", "check"]
 
 
@@ -47,6 +49,7 @@ def check(cfg: ReportConfig) -> None:
     Raises:
         ValueError: names the key, its value and what was expected.
     """
+    refuse_unknown_keys(cfg)
     if cfg.pairing not in ("seed", "mean"):
         raise ValueError(f"pairing={cfg.pairing}: expected seed or mean.")
     if not 0 < cfg.bootstrap.confidence < 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,9 @@ from typing import Any
 import numpy as np
 
 __all__ = ["RunFolder", "digest"]
+
+#: Temporary names: of :meth:`RunFolder.write`, of policies, and of TorchRL's checkpoints (being written or removed).
+_LEFTOVERS = (".[0-9]*.*", "*/.[0-9]*.*", ".*.partial", "checkpoints/.checkpoint-*")
 
 
 def digest(config: dict[str, Any]) -> str:
@@ -41,12 +45,13 @@ class RunFolder:
     """
 
     def __init__(self, path: Path, config: dict[str, Any], text: str) -> None:
-        self.path = path
+        self.path, self.config = path, config
         stamp = path / "config.json"
         try:
             path.mkdir(parents=True, exist_ok=True)
             if stamp.exists():
                 self._check_same(json.loads(stamp.read_text()), config)
+                self._remove_leftovers()
             self.write("config.yaml", lambda temporary: temporary.write_text(text))
             self.write(
                 "config.json", lambda temporary: temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
@@ -66,6 +71,15 @@ class RunFolder:
                 f"out={self.path} holds results of another configuration ({'; '.join(changed)}): choose another "
                 "folder, or leave `out` to its default, which differs for each configuration."
             )
+
+    def _remove_leftovers(self) -> None:
+        """Remove what was being written when the process was killed."""
+        for pattern in _LEFTOVERS:
+            for path in self.path.glob(pattern):
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
 
     def write(self, name: str, writer: Callable[[Path], Any]) -> Path:
         """Have ``writer`` fill a temporary file, then put it in place in one step."""

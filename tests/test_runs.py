@@ -91,6 +91,19 @@ def test_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
     assert contents(tmp_path) == before
 
 
+def test_what_a_killed_process_was_writing_is_removed_when_it_is_continued(tmp_path):
+    RunFolder(tmp_path, CONFIG, "").arrays("blocks/0", lambda: NUMBERS)
+    before = contents(tmp_path)
+    (tmp_path / "checkpoints").mkdir()
+    for name in (".12.eval.csv", "blocks/.12.1.npz", ".policy.safetensors.0a1b2c3d.partial"):
+        (tmp_path / name).write_text("half")
+    (tmp_path / "checkpoints" / ".checkpoint-000000000064.stage-0a").mkdir()
+    (tmp_path / ".hidden").write_text("somebody's")
+    RunFolder(tmp_path, CONFIG, "")
+    assert contents(tmp_path) == before | {".hidden": b"somebody's"}
+    assert not list((tmp_path / "checkpoints").iterdir())
+
+
 def test_computation_that_fails_leaves_nothing_behind(tmp_path):
     folder = RunFolder(tmp_path, CONFIG, "")
     with pytest.raises(AssertionError):
