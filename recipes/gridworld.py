@@ -8,7 +8,6 @@ An interrupted run continues where it was; a finished one only reports again. Se
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from tqdm import tqdm
 
 from recipes import gridworld_report
 from recipes.gridworld_config import GridworldConfig, check
+from recipes.launchers import fail
 from recipes.runs import RunFolder, digest
 from recipes.workers import run_all
 from torchrl_priors.envs import GridMaps, GridWorlds, sample_worlds
@@ -170,7 +170,7 @@ def students(cfg: GridworldConfig, folder: RunFolder) -> np.ndarray:
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="gridworld")
-def main(cfg: GridworldConfig) -> None:
+def main(cfg: GridworldConfig) -> str | None:
     """Run or continue a study."""
     try:
         check(cfg)
@@ -180,7 +180,8 @@ def main(cfg: GridworldConfig) -> None:
         episodes = students(cfg, folder)
         gridworld_report.write(cfg, folder, world_sampler(cfg, torch.from_numpy(taught["seed"])), taught, episodes)
     except (ValueError, OSError) as error:
-        sys.exit(f"Error: {error}")
+        return fail(f"Error: {error}")
+    return None
 
 
 if __name__ == "__main__":
