@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-import recipes.launchers  # noqa: F401  (hydra/launcher=cores)
 from recipes.mujoco_config import MujocoConfig, check
 from recipes.mujoco_run import Run, supervise
 from torchrl_priors import (
@@ -194,11 +193,12 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         ended = rollout["next", "done"].squeeze(-1)
         metrics["episode_return"] = rollout["next", "episode_reward"].squeeze(-1)[ended].mean()
         metrics["fps"] = torch.tensor((collector.frames - first) / (time.perf_counter() - start))
+        weight = None
         if agent.weight is not None:
             weight = agent.weight(rollout.select("observation_norm"))["prior_weight"].detach()
             for quantile in (5, 50, 95):
                 metrics[f"prior_weight_q{quantile:02d}"] = weight.quantile(quantile / 100)
-        run.log(collector.frames, metrics)
+        run.log(collector.frames, metrics, weight)
         if run.evaluation_is_due(collector.frames):
             result = evaluate(
                 test_env,
@@ -213,9 +213,9 @@ def train(cfg: MujocoConfig, run: Run) -> None:
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="mujoco")
-def main(cfg: MujocoConfig) -> None:
+def main(cfg: MujocoConfig) -> str | None:
     """Train, or continue training, one agent."""
-    supervise(cfg, check, train)
+    return supervise(cfg, check, train)
 
 
 if __name__ == "__main__":

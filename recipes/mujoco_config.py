@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
+from recipes.checks import refuse_unknown_keys, require_compiler
+from recipes.loggers import LOGGERS, require_logger
+from torchrl_priors.artifacts import ArtifactError, load_prior, read_manifest
+from torchrl_priors.collectors import make_vector_env
+from torchrl_priors.collectors.vector_env import check_vector_env
 from torchrl_priors.methods import get_method
 
 __all__ = ["MujocoConfig", "check"]
@@ -116,7 +123,9 @@ def check(cfg: MujocoConfig) -> None:
 
     Raises:
         ValueError: names the key, its value and what was expected.
+        ImportError: names the extra that is needed.
     """
+    refuse_unknown_keys(cfg)
     get_method(cfg.method)
     if cfg.method != "none":
         _require(
@@ -130,7 +139,7 @@ def check(cfg: MujocoConfig) -> None:
         "centering": (cfg.centering, ("none", "prior", "policy")),
         "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
         "weight.trained": (cfg.weight.trained, ("minibatch", "rollout")),
-        "logger": (cfg.logger, ("csv", "tensorboard", "wandb")),
+        "logger": (cfg.logger, LOGGERS),
     }
     for key, (choice, allowed) in options.items():
         _require(choice in allowed, key, choice, f"one of {', '.join(allowed)}")
@@ -161,6 +170,10 @@ def check(cfg: MujocoConfig) -> None:
     }
     for key, value in at_least_0.items():
         _require(0 <= value < float("inf"), key, value, "a number of at least 0")
+    _require(cfg.seed < 2**32, "seed", cfg.seed, "a number below 2**32")
+    finite = {"weight.init_bias": cfg.weight.init_bias, "prior.threshold": cfg.prior.threshold}
+    for key, value in finite.items():
+        _require(math.isfinite(value), key, value, "a finite number")
     shares = {"ppo.gamma": cfg.ppo.gamma, "ppo.gae_lambda": cfg.ppo.gae_lambda, "prior.prob": cfg.prior.prob}
     for key, value in shares.items():
         _require(0 <= value <= 1, key, value, "a number in [0, 1]")
@@ -172,3 +185,38 @@ def check(cfg: MujocoConfig) -> None:
     near = max(1, round(frames / batch)) * batch
     expected = f"a multiple of env.frames_per_batch={batch}, such as {near}"
     _require(frames % batch == 0, "total_frames", frames, expected)
+    require_logger(cfg.logger)
+    require_compiler(cfg.compile)
+    _check_env(cfg)
+    if cfg.method != "none":
+        _check_prior(cfg)
+
+
+def _check_env(cfg: MujocoConfig) -> None:
+    """Build one environment, so that a wrong name or argument is refused before there is a folder of the run."""
+    name = f"{cfg.env.id}-{cfg.env.version}"
+    try:
+        env = make_vector_env(name, 1, **cfg.env.kwargs)
+        check_vector_env(env)
+        env.close()
+    except ImportError:
+        raise
+    except Exception as error:  # Gymnasium's own, or whatever its environments raise
+        given = "".join(f", {key}={value}" for key, value in cfg.env.kwargs.items())
+        raise ValueError(f"env={name}{given}: cannot be used ({type(error).__name__}: {error}).") from None
+
+
+def _check_prior(cfg: MujocoConfig) -> None:
+    """Read the teacher, so that a wrong one is refused before there is a folder of the run."""
+    path = Path(str(cfg.prior.path))
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"prior.path={path}: {'a folder, expected a file' if path.is_dir() else 'no such file'}."
+        )
+    try:
+        load_prior(path, env_id=f"{cfg.env.id}-{cfg.env.version}")
+    except ArtifactError as error:
+        raise ValueError(f"prior.path: {error}") from None
+    if cfg.prior.degrade == "structural":
+        last = read_manifest(path).obs_dim - 1
+        _require(0 <= cfg.prior.feature <= last, "prior.feature", cfg.prior.feature, f"a number from 0 to {last}")

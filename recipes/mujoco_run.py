@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import sys
 import traceback
 from collections.abc import Callable
 from functools import partial
@@ -14,14 +13,13 @@ from typing import Any
 
 import pandas as pd
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import OmegaConf
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
-from torchrl.record.loggers import get_logger
 from tqdm import tqdm
 
+from recipes.launchers import fail, in_sweep
+from recipes.loggers import RunLogger
 from recipes.mujoco_config import MujocoConfig
 from recipes.runs import RunFolder, digest
 from torchrl_priors.artifacts import save_policy
@@ -82,14 +80,16 @@ class Run:
         self.next_checkpoint = _next_multiple(self.frames, self.cfg.checkpoint.interval)
         self.set_status("running", frames=self.frames)
         self.bar = tqdm(
-            total=self.cfg.total_frames, initial=self.frames, unit="frame", unit_scale=True, disable=_in_sweep()
+            total=self.cfg.total_frames, initial=self.frames, unit="frame", unit_scale=True, disable=in_sweep()
         )
         self.logger = None
         if self.cfg.logger != "csv":
-            self.logger = get_logger(self.cfg.logger, logger_name=str(self.folder.path), experiment_name="log")
+            path, matters = self.folder.path, self.folder.config
+            identity = f"{path.name}-{digest(matters | {'out': str(path.resolve())})}"
+            self.logger = RunLogger(self.cfg.logger, path, matters, self.frames, identity)
 
-    def log(self, frames: int, metrics: dict[str, Tensor]) -> None:
-        """Keep one rollout's metrics.
+    def log(self, frames: int, metrics: dict[str, Tensor], weights: Tensor | None = None) -> None:
+        """Keep one rollout's metrics; the prior weights of its states go to the logger only.
 
         Raises:
             TrainingError: a loss is not finite.
@@ -104,7 +104,10 @@ class Run:
         self.metrics.append(row)
         self.bar.update(frames - self.frames)
         self.frames = frames
-        self._to_logger("train", row)
+        if self.logger is not None:
+            self.logger.scalars("train", row)
+            if weights is not None:
+                self.logger.histogram("train/prior_weights", weights, frames)
 
     def evaluation_is_due(self, frames: int) -> bool:
         """Whether the policy is to be evaluated now: every ``evaluation.interval`` frames and at the end."""
@@ -127,7 +130,10 @@ class Run:
         }
         self.evaluations.append(row)
         self.bar.set_postfix({"return": f"{row['mean_return']:.0f}"})
-        self._to_logger("eval", row)
+        if in_sweep():  # bars of several runs would overwrite each other
+            print(f"{self.folder.path}: return {row['mean_return']:.1f} at {frames} frames", flush=True)
+        if self.logger is not None:
+            self.logger.scalars("eval", row)
         self._write_tables()
 
     def checkpoint_if_due(self, frames: int) -> None:
@@ -152,49 +158,37 @@ class Run:
             training={"method": self.cfg.method, "recipe": "recipes.mujoco"},
         )
         self.bar.close()
+        if self.logger is not None:
+            self.logger.close()
         self.set_status("finished", frames=self.frames, mean_return=last["mean_return"])
-        print(f"{self.folder.path}: return {last['mean_return']:.1f} at {self.frames} frames")
+        print(f"{self.folder.path}: finished, return {last['mean_return']:.1f} at {self.frames} frames", flush=True)
 
     def _write_tables(self) -> None:
         for name, rows in (("eval", self.evaluations), ("metrics", self.metrics)):
             table = pd.DataFrame(rows)
             self.folder.write(f"{name}.csv", partial(table.to_csv, index=False))
 
-    def _to_logger(self, prefix: str, row: dict[str, float]) -> None:
-        if self.logger is not None:
-            for name, value in row.items():
-                if name != "frames" and math.isfinite(value):
-                    self.logger.log_scalar(f"{prefix}/{name}", value, step=int(row["frames"]))
-
 
 def supervise(
     cfg: MujocoConfig, check: Callable[[MujocoConfig], None], train: Callable[[MujocoConfig, Run], None]
-) -> None:
-    """Check, train, and leave a status whatever happens: in a sweep a broken run does not stop the others."""
+) -> str | None:
+    """Check, train, and leave a status whatever happens. The error, in a sweep, whose other runs go on."""
     run = None
     torch.set_num_threads(1)
     try:
         check(cfg)
         run = Run(cfg)
         if run.status["state"] == "finished":
-            print(f"{run.folder.path}: finished already")
-            return
+            print(f"{run.folder.path}: finished already", flush=True)
+            return None
         train(cfg, run)
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
-        expected = isinstance(error, (ValueError, OSError, ImportError, TrainingError))
+    except Exception as error:
         if run is not None:
             run.set_status("failed", frames=getattr(run, "frames", 0), error=str(error))
-        if not expected:
+        if not isinstance(error, (ValueError, OSError, ImportError, TrainingError)):
             traceback.print_exc()
-        message = f"Error: {error}"
-        if _in_sweep():
-            print(message, file=sys.stderr)
-            return
-        sys.exit(message)
-
-
-def _in_sweep() -> bool:
-    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+        return fail(f"Error: {error}")
+    return None
 
 
 def _next_multiple(frames: int, interval: int) -> int:
@@ -209,6 +203,4 @@ def _rows_until(path: Path, frames: int) -> list[dict[str, float]]:
 
 
 def _sha256(path: Path) -> str:
-    if not path.is_file():
-        raise FileNotFoundError(f"prior.path={path}: no such file.")
     return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -14,39 +14,12 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig
+from mujoco_cases import ROOT, TINY, Interrupted, config, run
 
 pytest.importorskip("mujoco")
 from recipes import mujoco as recipe
 from recipes.export_best import ExportConfig, export
-from recipes.mujoco_config import check
-from recipes.mujoco_run import supervise
 from torchrl_priors.methods import METHODS
-
-ROOT = Path(__file__).parents[1]
-TINY = [
-    "env.num_envs=2",
-    "env.frames_per_batch=64",
-    "env.minibatch_size=32",
-    "total_frames=256",
-    "ppo.epochs=2",
-    "ppo.hidden=[8]",
-    "evaluation.interval=64",
-    "evaluation.episodes=2",
-    "checkpoint.interval=64",
-    "compile=false",
-]
-
-
-def config(out: Path, *overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("mujoco", overrides=[*TINY, f"out={out}", *overrides])
-
-
-def run(out: Path, *overrides: str) -> Path:
-    supervise(config(out, *overrides), check, recipe.train)
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +52,6 @@ def test_a_weight_trained_after_the_rollout_is_the_only_thing_trained_then(teach
     torch.manual_seed(0)
     agent = recipe.Agent(cfg, "Hopper-v5", 11, 3)
     assert set(agent.networks()) == {"actor", "critic", "weight", "raw_critic"}
-
-
-class Interrupted(BaseException):
-    """Stands for a kill between two rollouts."""
 
 
 @pytest.mark.parametrize(("method", "compiled"), [("none", False), ("ae2r", False), ("ae2r", True)])
@@ -144,6 +113,12 @@ def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
         ("td_error=both", "td_error=both"),
         ("ppo.lr=-1", "ppo.lr=-1"),
         ("prior.prob=2", "prior.prob=2"),
+        ("weight.init_bias=nan", "weight.init_bias=nan"),
+        ("seed=-1", "seed=-1"),
+        ("+foo=1", "foo: there is no such key"),
+        ("+ppo.foo=1", "ppo.foo: there is no such key"),
+        ("env.version=v99", "env=Hopper-v99"),
+        ("+env.kwargs.foo=1", "foo=1"),
     ],
 )
 def test_bad_input_is_refused_by_name_before_anything_is_written(override, message, tmp_path):
@@ -154,9 +129,14 @@ def test_bad_input_is_refused_by_name_before_anything_is_written(override, messa
 
 
 def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path):
-    foreign = tmp_path / "foreign.safetensors"
+    foreign, empty, cut = (tmp_path / f"{name}.safetensors" for name in ("foreign", "empty", "cut"))
     foreign.write_bytes(b"not a teacher")
+    empty.touch()
+    cut.write_bytes(teacher.read_bytes()[:-100])
     for path, env, message in (
+        (tmp_path, "hopper", "a folder, expected a file"),
+        (empty, "hopper", "empty.safetensors can't be used"),
+        (cut, "hopper", "cut.safetensors can't be used"),
         (tmp_path / "absent.safetensors", "hopper", "no such file"),
         (foreign, "hopper", "foreign.safetensors"),
         (teacher, "walker2d", "Hopper-v5"),
@@ -165,6 +145,18 @@ def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path)
         with pytest.raises(SystemExit) as error:
             run(out, f"env={env}", "method=e2r", f"prior.path={path}", "total_frames=256")
         assert message in str(error.value)
+        assert not out.exists()
+
+
+def test_a_missing_compiler_is_told_of_before_training(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch._inductor.config.cpp.cxx", (None, "no-such-compiler"))
+    monkeypatch.delenv("CXX", raising=False)
+    cpp_builder = pytest.importorskip("torch._inductor.cpp_builder")
+    cpp_builder.cpp_compiler_search.cache_clear()
+    with pytest.raises(SystemExit, match=r"compile=true: no C.. compiler .* compile=false"):
+        run(tmp_path / "out", "compile=true")
+    cpp_builder.cpp_compiler_search.cache_clear()
+    assert not (tmp_path / "out").exists()
 
 
 def test_nan_losses_stop_the_run_and_keep_the_last_checkpoint(tmp_path, monkeypatch):
@@ -192,7 +184,10 @@ def test_a_sweep_runs_every_combination_although_one_is_broken(tmp_path):
         f"hydra.sweep.dir={tmp_path}/sweep",
     ]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "COLUMNS": "200"})
-    assert result.stderr.count("Error: prior.path=None") == 2, result.stderr
+    assert result.returncode == 1
+    assert "Sweep: 2 of 4 runs are done, 2 failed." in result.stdout
+    for seed in range(2):
+        assert f"Failed: method=e2r seed={seed}: Error: prior.path=None" in result.stderr
     assert {path.parent.name for path in tmp_path.glob("*/policy.safetensors")} == {"none-0", "none-1"}
 
 

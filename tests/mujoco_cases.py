@@ -1,0 +1,40 @@
+"""Runs of the MuJoCo recipe that take a second."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from recipes import mujoco as recipe
+from recipes.mujoco_config import check
+from recipes.mujoco_run import supervise
+
+ROOT = Path(__file__).parents[1]
+TINY = [
+    "env.num_envs=2",
+    "env.frames_per_batch=64",
+    "env.minibatch_size=32",
+    "total_frames=256",
+    "ppo.epochs=2",
+    "ppo.hidden=[8]",
+    "evaluation.interval=64",
+    "evaluation.episodes=2",
+    "checkpoint.interval=64",
+    "compile=false",
+]
+
+
+def config(out: Path, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("mujoco", overrides=[*TINY, f"out={out}", *overrides])
+
+
+def run(out: Path, *overrides: str) -> Path:
+    supervise(config(out, *overrides), check, recipe.train)
+    return out
+
+
+class Interrupted(BaseException):
+    """Stands for a kill between two rollouts."""
