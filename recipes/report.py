@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 
 from recipes import report_gridworld
 from recipes.report_config import ReportConfig, check
-from recipes.report_figures import curve_table, figures
+from recipes.report_figures import TRAINING, curve_table, figures
 from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
 from recipes.report_runs import LeftOut, find, is_gridworld, name_groups, read, without_misfits
 from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
@@ -32,14 +32,12 @@ _CAPTIONS = {
     "area_ratios": "Area ratio to the baseline",
     "performance_profiles": "Performance profiles of the area ratio over environments and seeds",
     "improvement": "Probability that a run has the larger area under its evaluation curve",
+    **{
+        f"training_{metric}": f"{name[0].upper()}{name[1:]}, over training: mean, lowest and highest seed"
+        for metric, (name, _) in TRAINING.items()
+    },
     "prior_weights": "Prior weight over training: mean, and 5 % to 95 % of the states",
 }
-#: The paper's table: metric, its name, and whether it is the difference to the baseline.
-_DYNAMICS = (
-    ("loss_objective", "policy loss, difference", True),
-    ("entropy", "entropy, difference", True),
-    ("loss_prior", "auxiliary loss", False),
-)
 
 
 def report(cfg: ReportConfig) -> Path:
@@ -148,8 +146,7 @@ def _page(
             ]
         parts += [_figure(name) for name in pictures if name.startswith("improvement")]
     parts += ["## Training", _dynamics(tables["dynamics"])]
-    if "prior_weights" in pictures:
-        parts.append(_figure("prior_weights"))
+    parts += [_figure(name) for name in pictures if name.startswith(("training_", "prior_weights"))]
     files = ", ".join(f"[`{name}.csv`]({name}.csv)" for name in tables)
     parts.append(f"All numbers: {files}. Figures are there as PDF too.")
     return "\n\n".join(parts) + "\n"
@@ -172,7 +169,7 @@ def _dynamics(dynamics: pd.DataFrame) -> str:
     for (env, prior, method), group in dynamics.groupby(["env", "prior", "method"], sort=False):
         by_metric = group.set_index("metric")
         cells = []
-        for metric, _, differs in _DYNAMICS:
+        for metric, (_, differs) in TRAINING.items():
             row = by_metric.loc[metric] if metric in by_metric.index else None
             mean, std = ("difference", "difference_std") if differs else ("mean", "std")
             ours = "-" if row is None else plus_minus(row[mean], row[std], 3)
@@ -180,7 +177,7 @@ def _dynamics(dynamics: pd.DataFrame) -> str:
             cells.append(ours + paper)
         if set(cells) != {"-"}:
             rows.append([env, prior or "-", method, *cells])
-    head = ["env", "prior", "method", *(name for _, name, _ in _DYNAMICS)]
+    head = ["env", "prior", "method", *(name for name, _ in TRAINING.values())]
     text = (
         "Mean ± standard deviation over training and seeds; differences are to the baseline at the same frames. In "
         "square brackets what the paper reports with its own teachers (v3 environments; which Cω is not said)."

@@ -13,11 +13,20 @@ from torchrl_priors.methods import get_method
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots.benchmark import interval_panels, profile_panels, return_curves
 
-__all__ = ["curve_table", "figures"]
+__all__ = ["TRAINING", "curve_table", "figures"]
+
+TRAINING = {
+    "loss_objective": ("policy loss, difference", True),
+    "entropy": ("entropy, difference", True),
+    "loss_prior": ("auxiliary loss", False),
+}
+"""The paper's table: metrics, what they are called, and whether it gives the difference to the baseline."""
 
 _BASELINE = "PPO"
 #: Letters that fit above a panel.
 _TITLE = 30
+#: Points of a curve over training: rollouts are averaged down to this many.
+_POINTS = 50
 
 
 def _title(study: Study, env: str, prior: str) -> str:
@@ -74,6 +83,9 @@ def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvemen
             )
     if (weights := _prior_weights(study)) is not None:
         made["prior_weights"] = weights
+    for metric, (name, differs) in TRAINING.items():
+        if (figure := _training(study, metric, name, differs)) is not None:
+            made[f"training_{metric}"] = figure
     return made
 
 
@@ -133,3 +145,41 @@ def _prior_weights(study: Study) -> Figure | None:
     return return_curves(
         panels, steps, columns=_columns(study), ylabel=r"Prior weight $\omega$", ylim=(0, 1), outlined=True
     )
+
+
+def _training(study: Study, metric: str, name: str, differs: bool) -> Figure | None:
+    """A metric over training: mean over seeds, and from the lowest to the highest of them."""
+    panels: dict[str, dict[str, ConfidenceInterval]] = {}
+    steps: dict[str, dict[str, np.ndarray]] = {}
+    for env, prior in study.panels():
+        base = _by_frames(study, env, prior, study.cfg.baseline, metric)
+        for label in study.methods(env, prior):
+            curves = _by_frames(study, env, prior, label, metric)
+            if curves is None or (differs and label == study.cfg.baseline):
+                continue
+            if differs:
+                if base is None:
+                    continue
+                curves = curves.sub(base.mean(axis=1), axis=0).dropna(how="all")
+            if len(curves):
+                points = np.arange(len(curves)) * _POINTS // max(len(curves), _POINTS)
+                means = curves.groupby(points).mean()
+                title = _title(study, env, prior)
+                seeds = means.to_numpy()
+                panels.setdefault(title, {})[label] = ConfidenceInterval(
+                    seeds.mean(axis=1), seeds.min(axis=1), seeds.max(axis=1)
+                )
+                steps.setdefault(title, {})[label] = curves.index.to_series().groupby(points).mean().to_numpy()
+    if not panels:
+        return None
+    to = f" to {_BASELINE if study.cfg.baseline == 'none' else study.cfg.baseline}" if differs else ""
+    return return_curves(panels, steps, columns=_columns(study), ylabel=f"{name[0].upper()}{name[1:]}{to}")
+
+
+def _by_frames(study: Study, env: str, prior: str, label: str, metric: str) -> pd.DataFrame | None:
+    """A column per seed, at the frames that all of them have."""
+    runs = study.runs(env, prior, label)
+    if not runs or not all(metric in run.metrics for run in runs):
+        return None
+    columns = [run.metrics.set_index("frames")[metric] for run in runs]
+    return pd.concat(columns, axis=1, join="inner")

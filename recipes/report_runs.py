@@ -184,7 +184,7 @@ def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
     taught = [run for run in runs if run.degrade]
     files = _short_paths({str(run.settings.get("prior.path")) for run in taught})
     for run, told in zip(taught, _differences(taught, lambda run: run.degrade, _prior_settings), strict=True):
-        kind = f"{run.degrade} degradation" if run.degraded else "teacher"
+        kind = f"degraded teacher ({run.degrade})" if run.degraded else "teacher"
         settings = (files[str(value)] if key == "path" else f"{key}={_short(value)}" for key, value in told.items())
         run.prior = ", ".join([kind, *settings])
     differences = _differences(runs, lambda run: run.method, lambda run: _method_settings(run, cfg))

@@ -61,6 +61,7 @@ def test_a_report_has_every_table_and_figure_and_names_what_it_left_out(tmp_path
     text, written = page.read_text(), {file.name for file in page.parent.iterdir()}
     tables = {"returns", "area_ratio", "improvement", "dynamics", "curves", "left_out"}
     pictures = {"return_curves", "area_ratios", "performance_profiles", "prior_weights"}
+    pictures |= {"training_loss_objective", "training_entropy", "training_loss_prior"}
     pictures |= {"improvement_over_none", "improvement_over_e2r"}
     expected = {f"{name}.csv" for name in tables}
     expected |= {f"{name}.{suffix}" for name in pictures for suffix in ("pdf", "png")}
@@ -82,7 +83,7 @@ def test_a_report_is_the_same_every_time(tmp_path: Path) -> None:
 def test_variants_of_a_method_are_told_apart_and_priors_named_by_their_degradation(tmp_path: Path) -> None:
     study = study_of(write_study(tmp_path, seeds=1))
     assert study.labels == ["none", "e2r", "ae2r Cω=0.03", "ae2r Cω=1", "kickstart", "aligned"]
-    assert study.priors == ["teacher", "structural degradation"]
+    assert study.priors == ["teacher", "degraded teacher (structural)"]
     assert study.envs == ["HalfCheetah-v5", "Hopper-v5"]
 
 
