@@ -66,8 +66,8 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
     for stop in (128, 192):
         out, log = tmp_path / f"stopped-{stop}", recipe.Run.log
 
-        def stopping(self, frames, metrics, log=log, stop=stop):
-            log(self, frames, metrics)
+        def stopping(self, frames, *args, log=log, stop=stop):
+            log(self, frames, *args)
             if frames == stop:
                 raise Interrupted
 
