@@ -16,6 +16,7 @@ from typing import Any
 import hydra
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -59,6 +60,18 @@ def make_prior(cfg: MujocoConfig, env_id: str, obs_dim: int, act_dim: int) -> Ac
     return prior
 
 
+class OracleWeight(nn.Module):
+    """The prior weight of one who knows: 1 where a structurally degraded teacher is right, 0 where it is not."""
+
+    def __init__(self, feature: int, threshold: float) -> None:
+        super().__init__()
+        self.feature, self.threshold = feature, threshold
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """``[*B, obs_dim]`` to ``[*B, 1]``."""
+        return (observation[..., self.feature, None] <= self.threshold).to(observation.dtype)
+
+
 class Agent(nn.Module):
     """The networks of a run, its loss, and how a rollout is prepared for it."""
 
@@ -90,6 +103,9 @@ class Agent(nn.Module):
         prior = make_prior(cfg, env_id, obs_dim, act_dim)
         if spec.adaptive:
             self.weight = make_prior_weight(obs_dim, hidden, init_bias=cfg.weight.init_bias)
+            if cfg.weight.trained == "oracle":
+                oracle = OracleWeight(cfg.prior.feature, cfg.prior.threshold)
+                self.weight = TensorDictModule(oracle, in_keys=["observation"], out_keys=["prior_weight"])
             if cfg.td_error == "original" and spec.weight_target == "td":
                 self.raw_critic = make_critic(obs_dim, hidden)
         self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=options["centering"]))
@@ -117,7 +133,7 @@ class Agent(nn.Module):
     def networks(self) -> dict[str, nn.Module]:
         """What is trained, by name."""
         networks = {"actor": self.actor, "critic": self.critic, "weight": self.weight, "raw_critic": self.raw_critic}
-        return {name: network for name, network in networks.items() if network is not None}
+        return {name: network for name, network in networks.items() if network is not None and [*network.parameters()]}
 
     @torch.no_grad()
     def prepare(self, rollout: TensorDictBase) -> TensorDictBase:
@@ -195,7 +211,7 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         metrics["fps"] = torch.tensor((collector.frames - first) / (time.perf_counter() - start))
         weight = None
         if agent.weight is not None:
-            weight = agent.weight(rollout.select("observation_norm"))["prior_weight"].detach()
+            weight = agent.weight(rollout.select(*agent.weight.in_keys))["prior_weight"].detach()
             for quantile in (5, 50, 95):
                 metrics[f"prior_weight_q{quantile:02d}"] = weight.quantile(quantile / 100)
         run.log(collector.frames, metrics, weight)

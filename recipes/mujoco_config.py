@@ -138,7 +138,7 @@ def check(cfg: MujocoConfig) -> None:
         "td_error": (cfg.td_error, ("original", "shaped")),
         "centering": (cfg.centering, ("none", "prior", "policy")),
         "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
-        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout")),
+        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "oracle")),
         "logger": (cfg.logger, LOGGERS),
     }
     for key, (choice, allowed) in options.items():
@@ -178,6 +178,11 @@ def check(cfg: MujocoConfig) -> None:
     for key, value in shares.items():
         _require(0 <= value <= 1, key, value, "a number in [0, 1]")
     _require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
+    if cfg.weight.trained == "oracle":
+        degrade = cfg.prior.degrade
+        _require(
+            degrade == "structural", "prior.degrade", degrade, "structural, as weight.trained=oracle knows no other"
+        )
     batch, frames = cfg.env.frames_per_batch, cfg.total_frames
     envs, size = cfg.env.num_envs, cfg.env.minibatch_size
     _require(batch % envs == 0, "env.frames_per_batch", batch, f"a multiple of env.num_envs={envs}")

@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 import torch
 from mujoco_cases import ROOT, TINY, Interrupted, config, run
+from tensordict import TensorDict
 
 pytest.importorskip("mujoco")
 from recipes import mujoco as recipe
@@ -40,7 +41,13 @@ def test_every_method_trains_from_a_teacher_that_the_recipe_made(method, td_erro
 
 
 @pytest.mark.parametrize(
-    "options", [["prior.degrade=structural"], ["prior.degrade=random"], ["weight.trained=rollout"]]
+    "options",
+    [
+        ["prior.degrade=structural"],
+        ["prior.degrade=random"],
+        ["weight.trained=rollout"],
+        ["weight.trained=oracle", "prior.degrade=structural"],
+    ],
 )
 def test_degraded_teachers_and_late_weights_run(options, teacher, tmp_path):
     out = run(tmp_path, "method=ae2r", f"prior.path={teacher}", "total_frames=128", *options)
@@ -52,6 +59,20 @@ def test_a_weight_trained_after_the_rollout_is_the_only_thing_trained_then(teach
     torch.manual_seed(0)
     agent = recipe.Agent(cfg, "Hopper-v5", 11, 3)
     assert set(agent.networks()) == {"actor", "critic", "weight", "raw_critic"}
+
+
+def test_the_oracle_trusts_exactly_the_states_whose_advice_is_right(teacher, tmp_path):
+    options = ["method=aligned", f"prior.path={teacher}", "weight.trained=oracle", "prior.threshold=0.1"]
+    cfg = config(tmp_path, *options, "prior.degrade=structural")
+    agent = recipe.Agent(cfg, "Hopper-v5", 11, 3)
+    assert set(agent.networks()) == {"actor", "critic"}
+    states = TensorDict(observation=torch.randn(50, 11), batch_size=[50])
+    degraded = recipe.make_prior(cfg, "Hopper-v5", 11, 3).get_dist(states.copy()).mean
+    right = recipe.make_prior(config(tmp_path, *options), "Hopper-v5", 11, 3).get_dist(states.copy()).mean
+    trusted = agent.weight(states)["prior_weight"].squeeze(-1) == 1
+    assert 0 < trusted.sum() < 50
+    torch.testing.assert_close(degraded[trusted], right[trusted])
+    torch.testing.assert_close(degraded[~trusted], -right[~trusted])
 
 
 @pytest.mark.parametrize(("method", "compiled"), [("none", False), ("ae2r", False), ("ae2r", True)])
