@@ -29,9 +29,11 @@ from torchrl_priors import (
     ClipPPOPriorLoss,
     PriorBonus,
     PriorLogProb,
+    PriorTrust,
     RandomDegradation,
     StructuralDegradation,
     ValueOffset,
+    advice_evidence,
     get_method,
 )
 from torchrl_priors.artifacts import load_prior
@@ -84,7 +86,7 @@ class Agent(nn.Module):
         self.actor = make_actor(obs_dim, act_dim, hidden)
         self.critic = make_critic(obs_dim, hidden)
         self.critic.module = nn.Sequential(self.critic.module, ValueOffset())
-        options: dict[str, Any] = {"centering": cfg.centering, "bonus_coeff": cfg.bonus_coeff}
+        options: dict[str, Any] = {"centering": cfg.centering, "bonus_coeff": cfg.bonus_coeff, "td_error": cfg.td_error}
         ppo: dict[str, Any] = {
             "clip_epsilon": cfg.ppo.clip_epsilon,
             "entropy_bonus": True,
@@ -106,13 +108,22 @@ class Agent(nn.Module):
             if cfg.weight.trained == "oracle":
                 oracle = OracleWeight(cfg.prior.feature, cfg.prior.threshold)
                 self.weight = TensorDictModule(oracle, in_keys=["observation"], out_keys=["prior_weight"])
-            if cfg.td_error == "original" and spec.weight_target == "td":
+            if cfg.weight.trained == "trust":
+                self.weight = PriorTrust(
+                    obs_dim, listen=cfg.weight.listen, min_trust=cfg.weight.min_trust, in_keys=["observation_norm"]
+                )
+            if cfg.weight.trained in ("oracle", "trust"):
+                options["weight_target"] = "none"
+            elif cfg.td_error == "original" and spec.weight_target == "td":
                 self.raw_critic = make_critic(obs_dim, hidden)
-        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=options["centering"]))
+        self.prior = prior
+        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=cfg.centering))
         if spec.bonus != "none":
-            self.transforms.append(PriorBonus.from_method(cfg.method, self.weight, **options))
+            bonus = PriorBonus.from_method(
+                cfg.method, self.weight, centering=cfg.centering, bonus_coeff=cfg.bonus_coeff
+            )
+            self.transforms.append(bonus)
             self.advantage.set_keys(reward="shaped_reward")
-        options["td_error"] = cfg.td_error
         self.loss = AVECClipPPOPriorLoss(
             self.actor,
             self.critic,
@@ -141,6 +152,11 @@ class Agent(nn.Module):
         for transform in self.transforms:
             rollout = transform(rollout)
         rollout = self.advantage(rollout)
+        if isinstance(self.weight, PriorTrust) and not self.weight.decided:
+            # until it has decided there is no bonus either, so that this is an advantage on raw rewards
+            dist, prior_dist = self.actor.get_dist(rollout.copy()), self.prior.get_dist(rollout.copy())
+            evidence = advice_evidence(rollout["advantage"], rollout["prior_log_prob"], dist, prior_dist)
+            self.weight.update(rollout["observation_norm"], evidence)
         # Fewer entries make for faster minibatches.
         keys: Any = self.loss.in_keys
         read = [*keys, "advantage", "value_target", ("next", "prior_bonus")]
@@ -214,6 +230,8 @@ def train(cfg: MujocoConfig, run: Run) -> None:
             weight = agent.weight(rollout.select(*agent.weight.in_keys))["prior_weight"].detach()
             for quantile in (5, 50, 95):
                 metrics[f"prior_weight_q{quantile:02d}"] = weight.quantile(quantile / 100)
+        if isinstance(agent.weight, PriorTrust):
+            metrics["prior_trust"] = agent.weight.mean_trust
         run.log(collector.frames, metrics, weight)
         if run.evaluation_is_due(collector.frames):
             result = evaluate(

@@ -54,6 +54,8 @@ class Weight:
     init_bias: float = MISSING
     trained: str = MISSING
     epochs: int = MISSING
+    listen: int = MISSING
+    min_trust: float = MISSING
 
 
 @dataclass
@@ -138,7 +140,7 @@ def check(cfg: MujocoConfig) -> None:
         "td_error": (cfg.td_error, ("original", "shaped")),
         "centering": (cfg.centering, ("none", "prior", "policy")),
         "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
-        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "oracle")),
+        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "trust", "oracle")),
         "logger": (cfg.logger, LOGGERS),
     }
     for key, (choice, allowed) in options.items():
@@ -154,6 +156,7 @@ def check(cfg: MujocoConfig) -> None:
         "ppo.adam_eps": cfg.ppo.adam_eps,
         "ppo.max_grad_norm": cfg.ppo.max_grad_norm,
         "weight.epochs": cfg.weight.epochs,
+        "weight.listen": cfg.weight.listen,
         "evaluation.interval": cfg.evaluation.interval,
         "evaluation.episodes": cfg.evaluation.episodes,
         "checkpoint.interval": cfg.checkpoint.interval,
@@ -175,6 +178,7 @@ def check(cfg: MujocoConfig) -> None:
     for key, value in finite.items():
         _require(math.isfinite(value), key, value, "a finite number")
     shares = {"ppo.gamma": cfg.ppo.gamma, "ppo.gae_lambda": cfg.ppo.gae_lambda, "prior.prob": cfg.prior.prob}
+    shares["weight.min_trust"] = cfg.weight.min_trust
     for key, value in shares.items():
         _require(0 <= value <= 1, key, value, "a number in [0, 1]")
     _require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")

@@ -13,6 +13,7 @@ from torchrl_priors.metrics import (
     stratified_bootstrap_ci,
 )
 from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, ValueOffset, cross_entropy
+from torchrl_priors.prior_trust import PriorTrust, advice_evidence
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
@@ -29,11 +30,13 @@ __all__ = [
     "MethodSpec",
     "PriorBonus",
     "PriorLogProb",
+    "PriorTrust",
     "PriorWeight",
     "RandomDegradation",
     "StructuralDegradation",
     "UniformPrior",
     "ValueOffset",
+    "advice_evidence",
     "area_ratio",
     "area_under_curve",
     "cross_entropy",

@@ -74,7 +74,8 @@ class AE2RLoss(LossModule):
         method (str or MethodSpec): ``"none"``, ``"er"``, ``"e2r"``, ``"aer"``, ``"ae2r"``, ``"kickstart"`` or
             ``"aligned"``. ``"none"`` and ``"er"`` have no loss here. Defaults to ``"ae2r"``.
         td_error (str): ``"original"`` (a critic that never sees the bonus) or ``"shaped"``. Defaults to ``"original"``.
-        weight_target (str, optional): ``"td"`` or ``"advantage"``. Defaults to ``None``: the method's.
+        weight_target (str, optional): ``"td"``, ``"advantage"``, or ``"none"`` for a weight that this loss only reads.
+            Defaults to ``None``: the method's.
         centering (str): ``"none"``, or ``"prior"`` or ``"policy"`` if the bonus is centred; the centre is read from the
             batch. Defaults to ``"none"``.
         bonus_coeff (float): coefficient of the bonus in the shaped reward. Defaults to 1.0.
@@ -185,7 +186,7 @@ class AE2RLoss(LossModule):
         *,
         method: str | MethodSpec = "ae2r",
         td_error: Literal["original", "shaped"] = "original",
-        weight_target: Literal["td", "advantage"] | None = None,
+        weight_target: Literal["td", "advantage", "none"] | None = None,
         centering: Literal["none", "prior", "policy"] = "none",
         bonus_coeff: float = 1.0,
         aux_coeff: float = 1.0,
@@ -201,7 +202,7 @@ class AE2RLoss(LossModule):
         spec = get_method(method) if isinstance(method, str) else method
         weight_target = spec.weight_target if weight_target is None else weight_target
         _check_option("td_error", td_error, ("original", "shaped"))
-        _check_option("weight_target", weight_target, ("td", "advantage"))
+        _check_option("weight_target", weight_target, ("td", "advantage", "none"))
         _check_option("centering", centering, ("none", "prior", "policy"))
         _check_option("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
         if prior_in_batch and not isinstance(prior, ActionPrior):
@@ -299,7 +300,8 @@ class AE2RLoss(LossModule):
                 keys += self.prior_weight.in_keys if self.spec.auxiliary or not shifted else []
                 keys += [_next(key) for key in self.prior_weight.in_keys] if shifted else []
                 where = _next if shifted else _root
-                keys.append(where(names.prior_log_prob))
+                if self.weight_target != "none":
+                    keys.append(where(names.prior_log_prob))
                 if self.weight_target == "td" and self.centering != "none":
                     keys.append(where(names.prior_center))
                 if self.weight_target == "advantage":
@@ -322,7 +324,7 @@ class AE2RLoss(LossModule):
         if self._out_keys is None:
             keys: list[NestedKey] = []
             keys += ["loss_prior"] if self.spec.auxiliary else []
-            keys += ["loss_prior_weight"] if self.spec.adaptive else []
+            keys += ["loss_prior_weight"] if self.spec.adaptive and self.weight_target != "none" else []
             keys += ["loss_prior_critic"] if self._trains_critic else []
             keys += ["prior_cross_entropy", "prior_kl"] if self._needs_cross_entropy else []
             keys += ["prior_weight"] if self.spec.adaptive else []
@@ -357,10 +359,13 @@ class AE2RLoss(LossModule):
                     losses["loss_prior_critic"] = self.critic_coeff * loss_critic
             if self.weight_target == "advantage":
                 weight, loss_weight = self._regress_on_advantage(tensordict, delta, entropy)
-            else:
+            elif self.weight_target == "td":
                 weight, loss_weight = self._regress_on_td_error(tensordict, delta)
+            else:
+                weight, loss_weight = self._evaluate("prior_weight", tensordict, self.tensor_keys.prior_weight), None
             logs["prior_weight"] = weight
-            losses["loss_prior_weight"] = self.weight_coeff * loss_weight
+            if loss_weight is not None:
+                losses["loss_prior_weight"] = self.weight_coeff * loss_weight
         if self.spec.auxiliary and entropy is not None:
             losses["loss_prior"] = self.aux_coeff * (entropy if weight is None else weight.detach() * entropy)
         bonus = tensordict.get(_next(self.tensor_keys.prior_bonus), None)

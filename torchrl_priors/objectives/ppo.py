@@ -121,7 +121,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
         *,
         method: str | MethodSpec = "ae2r",
         td_error: Literal["original", "shaped"] = "original",
-        weight_target: Literal["td", "advantage"] | None = None,
+        weight_target: Literal["td", "advantage", "none"] | None = None,
         centering: Literal["none", "prior", "policy"] = "none",
         bonus_coeff: float = 1.0,
         aux_coeff: float = 1.0,
