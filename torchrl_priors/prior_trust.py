@@ -92,10 +92,10 @@ class PriorTrust(TensorDictModuleBase):
         num_features (int): of the entry it reads, ``[*B, num_features]``, about standardised.
 
     Keyword Args:
-        listen (int): frames to listen to. Defaults to 32768.
-        min_trust (float): in [0, 1]. Defaults to 0.72; calibrated, see ``results/mujoco``.
+        listen (int): frames to listen to. Defaults to 49152.
+        min_trust (float): in [0, 1]. Defaults to 0.7; calibrated, see ``results/mujoco``.
         num_random (int): tanh features beside the linear ones and the constant. Defaults to 64.
-        prior_std (float): :math:`\tau`. Defaults to 0.1.
+        prior_std (float): :math:`\tau`. Defaults to 0.05.
         seed (int): of the random features. Defaults to 0.
         in_keys (list of NestedKey, optional): one entry. Defaults to ``["observation"]``.
         out_keys (list of NestedKey, optional): one entry, ``[*B, 1]``. Defaults to ``["prior_weight"]``.
@@ -120,10 +120,10 @@ class PriorTrust(TensorDictModuleBase):
         self,
         num_features: int,
         *,
-        listen: int = 32_768,
-        min_trust: float = 0.72,
+        listen: int = 49_152,
+        min_trust: float = 0.7,
         num_random: int = 64,
-        prior_std: float = 0.1,
+        prior_std: float = 0.05,
         seed: int = 0,
         in_keys: list[NestedKey] | None = None,
         out_keys: list[NestedKey] | None = None,
