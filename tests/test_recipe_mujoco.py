@@ -47,6 +47,7 @@ def test_every_method_trains_from_a_teacher_that_the_recipe_made(method, td_erro
         ["prior.degrade=random"],
         ["weight.trained=rollout"],
         ["weight.trained=oracle", "prior.degrade=structural"],
+        ["weight.trained=trust", "weight.listen=64"],
     ],
 )
 def test_degraded_teachers_and_late_weights_run(options, teacher, tmp_path):
@@ -75,13 +76,15 @@ def test_the_oracle_trusts_exactly_the_states_whose_advice_is_right(teacher, tmp
     torch.testing.assert_close(degraded[~trusted], -right[~trusted])
 
 
-@pytest.mark.parametrize(("method", "compiled"), [("none", False), ("ae2r", False), ("ae2r", True)])
+@pytest.mark.parametrize(
+    ("method", "compiled"), [("none", False), ("ae2r", False), ("ae2r", True), ("aligned weight.trained=trust", False)]
+)
 def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
     method, compiled, teacher, tmp_path, monkeypatch
 ):
     if compiled and shutil.which("g++") is None and shutil.which("clang++") is None:
         pytest.skip("no C++ compiler")
-    options = [f"method={method}", "checkpoint.interval=128", f"compile={compiled}"]
+    options = [*f"method={method}".split(), "checkpoint.interval=128", f"compile={compiled}", "weight.listen=160"]
     options += [] if method == "none" else [f"prior.path={teacher}", "prior.degrade=random"]
     whole = run(tmp_path / "whole", *options)
     for stop in (128, 192):
