@@ -117,7 +117,7 @@ class Agent(nn.Module):
             elif cfg.td_error == "original" and spec.weight_target == "td":
                 self.raw_critic = make_critic(obs_dim, hidden)
         self.prior = prior
-        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=cfg.centering))
+        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=options["centering"]))
         if spec.bonus != "none":
             bonus = PriorBonus.from_method(
                 cfg.method, self.weight, centering=cfg.centering, bonus_coeff=cfg.bonus_coeff
