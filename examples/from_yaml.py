@@ -1,7 +1,9 @@
 """A trainer from a YAML file: ``from_yaml.yaml`` names this library's configs beside TorchRL's own.
 
-python examples/from_yaml.py
-python examples/from_yaml.py method=e2r
+The student swings a pendulum up, with the bot of ``ppo.py`` as its teacher.
+
+    python examples/from_yaml.py
+    python examples/from_yaml.py method=e2r
 """
 
 import hydra
