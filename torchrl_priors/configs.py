@@ -129,7 +129,7 @@ def _config(make: Callable[..., Any], base: type, *sources: Callable[..., Any], 
     parameters: dict[str, Any] = {}
     needed = {"actor"} if base is TransformConfig else set()
     for source in sources:
-        of = source.__init__ if inspect.isclass(source) else source  # type: ignore[misc]
+        of = source.__init__ if inspect.isclass(source) else source
         for name, parameter in inspect.signature(of).parameters.items():
             if (
                 parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
