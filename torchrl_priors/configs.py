@@ -127,14 +127,11 @@ def make_prior_shaping(**settings: Any) -> PriorShaping:
 def _config(make: Callable[..., Any], base: type, *sources: Callable[..., Any], **more: Any) -> type:
     """A config with the parameters of ``sources`` as fields, the later ones winning."""
     parameters: dict[str, Any] = {}
-    needed = {"actor"} if base is TransformConfig else set()
+    skipped = _SKIPPED - {"actor"} if base is TransformConfig else _SKIPPED  # the transforms' actor is not deprecated
     for source in sources:
         of = source.__init__ if inspect.isclass(source) else source
         for name, parameter in inspect.signature(of).parameters.items():
-            if (
-                parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
-                and name not in _SKIPPED - needed
-            ):
+            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL) and name not in skipped:
                 parameters[name] = MISSING if parameter.default is parameter.empty else parameter.default
     fields = {**parameters, **more, "_target_": f"{__name__}.{make.__name__}", "_partial_": False}
     return make_dataclass(
