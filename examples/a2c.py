@@ -6,6 +6,8 @@ must never be fed with another's normaliser.
 
     python examples/a2c.py
      51200 frames, return -132.1     (seed 0, the last line; 9 s of one core)
+    python examples/a2c.py --method none
+     51200 frames, return -200.0
 """
 
 import argparse
