@@ -2,6 +2,7 @@
 
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
+from torchrl_priors.hooks import PriorShaping
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 from torchrl_priors.metrics import (
     area_ratio,
@@ -30,6 +31,7 @@ __all__ = [
     "MethodSpec",
     "PriorBonus",
     "PriorLogProb",
+    "PriorShaping",
     "PriorTrust",
     "PriorWeight",
     "RandomDegradation",
@@ -45,6 +47,28 @@ __all__ = [
     "mean_confidence_interval",
     "performance_profile",
     "probability_of_improvement",
+    "register_configs",
     "sample_worlds",
     "stratified_bootstrap_ci",
 ]
+
+
+def register_configs() -> None:
+    """Adds this library to TorchRL's Hydra config groups, so that a YAML file can name it beside TorchRL's own.
+
+    ``transform``: ``prior_log_prob``, ``prior_bonus``. ``loss``: ``ae2r``, ``clip_ppo_prior``. ``model``:
+    ``prior_weight``. ``hook``: ``prior_shaping``, which gives a trainer both transforms. ``prior``, a group of this
+    library: ``action``, ``artifact``, ``boltzmann``, ``uniform``. Call it before Hydra composes a config; more than
+    once does no harm. TorchRL's own configs are registered too.
+
+    Raises:
+        ImportError: Hydra is not installed.
+
+    Examples:
+        >>> import torchrl_priors
+        >>> torchrl_priors.register_configs()  # doctest: +SKIP
+        >>> # defaults: [transform: prior_bonus, loss: clip_ppo_prior, _self_]
+    """
+    from torchrl_priors.configs import register
+
+    register()

@@ -8,13 +8,24 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
+from torchrl.objectives import LossModule
 
-__all__ = ["BatchTransform", "under_next"]
+from torchrl_priors.objectives import AE2RLoss
+
+__all__ = ["BatchTransform", "prior_loss_of", "under_next"]
 
 
 def under_next(key: NestedKey) -> NestedKey:
     """The key of the same entry of the next step."""
     return unravel_key(("next", key))
+
+
+def prior_loss_of(loss: LossModule) -> AE2RLoss:
+    """The loss itself, or the one of the prior in a loss of both."""
+    inner = getattr(loss, "prior_loss", loss)
+    if not isinstance(inner, AE2RLoss):
+        raise TypeError(f"Expected an AE2RLoss or a ClipPPOPriorLoss, got {type(loss).__name__}.")
+    return inner
 
 
 class BatchTransform(Transform):

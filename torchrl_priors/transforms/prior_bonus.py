@@ -8,11 +8,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor
+from torchrl.objectives import LossModule
 
 from torchrl_priors.functional import prior_bonus
 from torchrl_priors.methods import get_method
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.transforms.batch_transform import BatchTransform, under_next
+from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of, under_next
 
 __all__ = ["PriorBonus"]
 
@@ -119,6 +120,40 @@ class PriorBonus(BatchTransform):
         if spec.adaptive and prior_weight is None:
             raise ValueError(f"The method {method!r} has a learned weight: pass prior_weight.")
         return cls(prior_weight if spec.adaptive else None, shift=spec.bonus, **kwargs)
+
+    @classmethod
+    def from_loss(cls, loss: LossModule, **kwargs: Any) -> PriorBonus:
+        """The bonus that belongs to a loss: with its weight, its method, its coefficient and its keys.
+
+        Args:
+            loss (AE2RLoss or ClipPPOPriorLoss): as it is now; later changes of its coefficients or keys are not seen.
+            **kwargs: further keyword arguments of the class, or others than the loss's.
+
+        Raises:
+            TypeError: a loss of another kind.
+
+        Examples:
+            >>> from torchrl_priors import AE2RLoss, UniformPrior
+            >>> actor = UniformPrior(2).module  # any policy
+            >>> PriorBonus.from_loss(AE2RLoss(actor, UniformPrior(2), method="e2r", bonus_coeff=0.5)).bonus_coeff
+            tensor(0.5000)
+        """
+        inner = prior_loss_of(loss)
+        keys = inner.tensor_keys
+        shaped = getattr(loss.tensor_keys, "raw_reward", None) and loss.tensor_keys.reward
+        if shaped is None or shaped == keys.reward:  # the loss does not say, or has no bonus
+            shaped = "shaped_reward"
+        settings: dict[str, Any] = {
+            "shift": inner.spec.bonus,
+            "bonus_coeff": inner.bonus_coeff.item(),
+            "centering": inner.centering,
+            "reward_key": keys.reward,
+            "terminated_key": keys.terminated,
+            "log_prob_key": keys.prior_log_prob,
+            "center_key": keys.prior_center,
+            "out_keys": [under_next(keys.prior_bonus), under_next(shaped)],
+        }
+        return cls(inner.prior_weight if inner.spec.adaptive else None, **{**settings, **kwargs})
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -10,11 +10,12 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torch import distributions as d
+from torchrl.objectives import LossModule
 
 from torchrl_priors.functional import has_next_action, shift_to_next
 from torchrl_priors.objectives.cross_entropy import cross_entropy
 from torchrl_priors.priors import ActionPrior
-from torchrl_priors.transforms.batch_transform import BatchTransform, under_next
+from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of, under_next
 
 __all__ = ["PriorLogProb"]
 
@@ -130,6 +131,36 @@ class PriorLogProb(BatchTransform):
         self.terminated_key = under_next(terminated_key)
         self.traj_key = unravel_key(traj_key)
         self.mask_key = unravel_key(mask_key)
+
+    @classmethod
+    def from_loss(cls, loss: LossModule, **kwargs: Any) -> PriorLogProb:
+        """The log-probabilities that a loss reads: with its prior, its student, its centering and its keys.
+
+        Args:
+            loss (AE2RLoss or ClipPPOPriorLoss): as it is now; later changes of its keys are not seen.
+            **kwargs: further keyword arguments of the class, or others than the loss's.
+
+        Raises:
+            TypeError: a loss of another kind.
+
+        Examples:
+            >>> from torchrl_priors import AE2RLoss, UniformPrior
+            >>> loss = AE2RLoss(UniformPrior(2).module, UniformPrior(2), method="e2r", centering="prior")
+            >>> PriorLogProb.from_loss(loss, time_dim=1).out_keys
+            ['prior_log_prob', 'prior_center']
+        """
+        inner = prior_loss_of(loss)
+        keys = inner.tensor_keys
+        settings: dict[str, Any] = {
+            "centering": inner.centering,
+            "keep_params": inner.prior_in_batch,
+            "num_samples": inner.num_samples,
+            "done_key": getattr(loss.tensor_keys, "done", "done"),
+            "terminated_key": keys.terminated,
+        }
+        settings.update(kwargs)
+        names = [keys.prior_log_prob] + ([] if settings["centering"] == "none" else [keys.prior_center])
+        return cls(inner.prior, inner.actor_network, **{"out_keys": names, **settings})
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,0 +1,81 @@
+"""The trainer hook and the transforms of a loss: same networks, settings and keys as the loss."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from objectives_cases import make_actor, make_critic
+from torch import nn
+
+from torchrl_priors import (
+    ActionPrior,
+    AE2RLoss,
+    ClipPPOPriorLoss,
+    PriorBonus,
+    PriorLogProb,
+    PriorShaping,
+    PriorWeight,
+)
+
+
+def make_loss(method: str = "ae2r", **kwargs: object) -> ClipPPOPriorLoss:
+    weight = PriorWeight(nn.Linear(3, 1))
+    prior = ActionPrior(make_actor())
+    return ClipPPOPriorLoss(make_actor(), make_critic(), prior, weight, make_critic(), method=method, **kwargs)
+
+
+@pytest.mark.parametrize("functional", [True, False])
+def test_transforms_share_the_networks_of_the_loss(functional: bool) -> None:
+    loss = make_loss(functional=functional)
+    log_prob, bonus = PriorLogProb.from_loss(loss), PriorBonus.from_loss(loss)
+    assert log_prob.prior is loss.prior_loss.prior
+    assert log_prob.__dict__["actor"] is loss.actor_network
+    assert bonus.__dict__["prior_weight"] is loss.prior_loss.prior_weight
+
+
+def test_transforms_have_the_settings_of_the_loss() -> None:
+    loss = make_loss("aer", bonus_coeff=0.25, centering="prior", num_samples=3, prior_in_batch=True)
+    log_prob, bonus = PriorLogProb.from_loss(loss), PriorBonus.from_loss(loss)
+    assert (log_prob.centering, log_prob.num_samples, log_prob.keep_params) == ("prior", 3, True)
+    assert (bonus.shift, bonus.centering, bonus.bonus_coeff.item()) == ("current", "prior", 0.25)
+
+
+def test_transforms_have_the_keys_of_the_loss() -> None:
+    loss = make_loss()
+    names = ("done", "terminated", "prior_log_prob", "prior_bonus")
+    loss.set_keys(
+        **{name: ("agent", name) for name in names}, raw_reward=("agent", "reward"), reward=("agent", "shaped")
+    )
+    log_prob, bonus = PriorLogProb.from_loss(loss), PriorBonus.from_loss(loss)
+    assert log_prob.out_keys == [("agent", "prior_log_prob")]
+    assert (log_prob.done_key, log_prob.terminated_key) == (("next", "agent", "done"), ("next", "agent", "terminated"))
+    assert bonus.in_keys == [("next", "agent", "reward")]
+    assert bonus.out_keys == [("next", "agent", "prior_bonus"), ("next", "agent", "shaped")]
+
+
+@pytest.mark.parametrize("method", ["none", "kickstart"])
+def test_methods_without_a_bonus_leave_the_reward_as_it_is(method: str) -> None:
+    bonus = PriorBonus.from_loss(make_loss(method))
+    assert bonus.shift == "none"
+    assert bonus.out_keys[1] == ("next", "shaped_reward")
+
+
+def test_settings_of_the_caller_win() -> None:
+    loss = AE2RLoss(make_actor(), ActionPrior(make_actor()), method="e2r")
+    assert PriorLogProb.from_loss(loss, boundary="zero").boundary == "zero"
+    assert PriorBonus.from_loss(loss, bonus_coeff=2.0).bonus_coeff == torch.tensor(2.0)
+
+
+def test_another_loss_is_refused() -> None:
+    for transform in (PriorLogProb, PriorBonus):
+        with pytest.raises(TypeError, match="AE2RLoss or a ClipPPOPriorLoss, got Linear"):
+            transform.from_loss(nn.Linear(1, 1))
+
+
+def test_hook_refuses_what_it_cannot_shape() -> None:
+    with pytest.raises(RuntimeError, match="register"):
+        PriorShaping()(None)
+    with pytest.raises(ValueError, match="async_collection=False"):
+        PriorShaping().register(SimpleNamespace(async_collection=True, loss_module=make_loss()))

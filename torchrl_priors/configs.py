@@ -1,0 +1,164 @@
+"""This library in TorchRL's Hydra config groups.
+
+A config has the fields of the class that it builds, with its defaults, and one or two more that are said below. Keys
+are written as in TorchRL's own configs: ``action_key: [agent, action]`` is ``("agent", "action")``.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import field, make_dataclass
+from typing import Any
+
+try:
+    from hydra.core.config_store import ConfigStore
+    from omegaconf import MISSING
+except ImportError as error:
+    raise ImportError(
+        "Configs need Hydra: install the extra 'recipes' (pip install 'torchrl-priors[recipes]') or hydra-core."
+    ) from error
+from tensordict import NestedKey
+from torchrl.objectives import ClipPPOLoss, PPOLoss
+from torchrl.trainers.algorithms.configs import ConfigBase, HookConfig, LossConfig, TransformConfig
+
+from torchrl_priors.artifacts import load_prior
+from torchrl_priors.hooks import PriorShaping
+from torchrl_priors.objectives import AE2RLoss, ClipPPOPriorLoss
+from torchrl_priors.prior_weight import PriorWeight
+from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.transforms import PriorBonus, PriorLogProb
+
+__all__ = ["register"]
+
+# deprecated by TorchRL, or, as classes, nothing that YAML has (their defaults are the constructors')
+_SKIPPED = {"self", "actor", "critic", "advantage_key", "value_target_key", "value_key", "distribution_class"}
+
+
+def nested_key(value: Any) -> NestedKey:
+    """A key from YAML: a list of its parts, or a string."""
+    if value is None or isinstance(value, str):
+        return value
+    parts = tuple(value)
+    return parts[0] if len(parts) == 1 else parts
+
+
+def _plain(name: str, value: Any) -> Any:
+    """A setting from YAML as the constructors take it."""
+    if name.endswith("_key") or name == "namespace":
+        return nested_key(value)
+    if name.endswith("_keys") and value is not None:
+        return [nested_key(key) for key in value]
+    if name == "clip_epsilon" and value is not None and not isinstance(value, (int, float)):
+        return tuple(value)
+    return value
+
+
+def _settings(settings: dict[str, Any]) -> dict[str, Any]:
+    return {name: _plain(name, value) for name, value in settings.items()}
+
+
+def make_prior(cls: Callable[..., ActionPrior], action_key: Any = None, **settings: Any) -> ActionPrior:
+    """A prior, which finds the student's action under ``action_key``."""
+    prior = cls(**_settings(settings))
+    if action_key is not None:
+        prior.set_keys(action=nested_key(action_key))
+    return prior
+
+
+def make_action_prior(**settings: Any) -> ActionPrior:
+    """What ``prior: action`` builds."""
+    return make_prior(ActionPrior, **settings)
+
+
+def make_boltzmann_prior(**settings: Any) -> ActionPrior:
+    """What ``prior: boltzmann`` builds."""
+    return make_prior(BoltzmannPrior, **settings)
+
+
+def make_uniform_prior(**settings: Any) -> ActionPrior:
+    """What ``prior: uniform`` builds."""
+    return make_prior(UniformPrior, **settings)
+
+
+def make_artifact_prior(**settings: Any) -> ActionPrior:
+    """What ``prior: artifact`` builds: a policy from a file."""
+    return make_prior(load_prior, **settings)
+
+
+def make_prior_weight(**settings: Any) -> PriorWeight:
+    """What ``model: prior_weight`` builds."""
+    return PriorWeight(**_settings(settings))
+
+
+def make_prior_log_prob(**settings: Any) -> PriorLogProb:
+    """What ``transform: prior_log_prob`` builds."""
+    return PriorLogProb(**_settings(settings))
+
+
+def make_prior_bonus(method: str | None = None, **settings: Any) -> PriorBonus:
+    """What ``transform: prior_bonus`` builds; ``method`` stands for ``shift``."""
+    settings = _settings(settings)
+    if method is None:
+        return PriorBonus(**settings)
+    settings.pop("shift", None)
+    return PriorBonus.from_method(method, **settings)
+
+
+def make_ae2r_loss(keys: Any = None, **settings: Any) -> AE2RLoss:
+    """What ``loss: ae2r`` builds; ``keys`` are for ``set_keys``."""
+    loss = AE2RLoss(**_settings(settings))
+    loss.set_keys(**{name: nested_key(key) for name, key in (keys or {}).items()})
+    return loss
+
+
+def make_clip_ppo_prior_loss(keys: Any = None, **settings: Any) -> ClipPPOPriorLoss:
+    """What ``loss: clip_ppo_prior`` builds; ``keys`` are for ``set_keys``."""
+    loss = ClipPPOPriorLoss(**_settings(settings))
+    loss.set_keys(**{name: nested_key(key) for name, key in (keys or {}).items()})
+    return loss
+
+
+def make_prior_shaping(**settings: Any) -> PriorShaping:
+    """What ``hook: prior_shaping`` builds."""
+    return PriorShaping(**_settings(settings))
+
+
+def _config(make: Callable[..., Any], base: type, *sources: Callable[..., Any], **more: Any) -> type:
+    """A config with the parameters of ``sources`` as fields, the later ones winning."""
+    parameters: dict[str, Any] = {}
+    skipped = _SKIPPED - {"actor"} if base is TransformConfig else _SKIPPED  # the transforms' actor is not deprecated
+    for source in sources:
+        of = source.__init__ if inspect.isclass(source) else source
+        for name, parameter in inspect.signature(of).parameters.items():
+            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL) and name not in skipped:
+                parameters[name] = MISSING if parameter.default is parameter.empty else parameter.default
+    fields = {**parameters, **more, "_target_": f"{__name__}.{make.__name__}", "_partial_": False}
+    return make_dataclass(
+        make.__name__.removeprefix("make_").title().replace("_", "") + "Config",
+        [(name, Any, field(default=value)) for name, value in fields.items()],
+        bases=(base,),
+        namespace={"__post_init__": lambda self: None, "__module__": __name__},
+    )
+
+
+def register() -> None:
+    """Stores the configs beside TorchRL's own; see :func:`torchrl_priors.register_configs`."""
+    store = ConfigStore.instance().store
+    for group, name, node in (
+        ("prior", "action", _config(make_action_prior, ConfigBase, ActionPrior, action_key=None)),
+        ("prior", "artifact", _config(make_artifact_prior, ConfigBase, load_prior, action_key=None)),
+        ("prior", "boltzmann", _config(make_boltzmann_prior, ConfigBase, BoltzmannPrior, action_key=None)),
+        ("prior", "uniform", _config(make_uniform_prior, ConfigBase, UniformPrior, action_key=None)),
+        ("model", "prior_weight", _config(make_prior_weight, ConfigBase, PriorWeight)),
+        ("transform", "prior_log_prob", _config(make_prior_log_prob, TransformConfig, PriorLogProb)),
+        ("transform", "prior_bonus", _config(make_prior_bonus, TransformConfig, PriorBonus, method=None)),
+        ("loss", "ae2r", _config(make_ae2r_loss, LossConfig, AE2RLoss, keys=None)),
+        (
+            "loss",
+            "clip_ppo_prior",
+            _config(make_clip_ppo_prior_loss, LossConfig, PPOLoss, ClipPPOLoss, ClipPPOPriorLoss, keys=None),
+        ),
+        ("hook", "prior_shaping", _config(make_prior_shaping, HookConfig, PriorShaping)),
+    ):
+        store(group=group, name=name, node=node, provider="torchrl_priors")
