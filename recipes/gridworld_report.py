@@ -28,7 +28,17 @@ __all__ = ["write"]
 
 _PAPER = Path(__file__).parent / "data" / "paper_area_ratio.csv"
 #: Pairs of methods worth a direct comparison on the same worlds.
-_COMPARISONS = (("aer", "er"), ("ae2r", "e2r"), ("aligned", "ae2r"), ("aligned", "kickstart"), ("kickstart", "e2r"))
+_COMPARISONS = (
+    ("aer", "er"),
+    ("ae2r", "e2r"),
+    ("aligned", "ae2r"),
+    ("aligned", "kickstart"),
+    ("kickstart", "e2r"),
+    ("aligned", "annealed_kickstart"),
+    ("aligned", "kl_penalty"),
+    ("ae2r", "annealed_kickstart"),
+    ("ae2r", "kl_penalty"),
+)
 
 
 class Episodes:

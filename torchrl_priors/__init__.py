@@ -15,6 +15,7 @@ from torchrl_priors.metrics import (
 from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, ValueOffset, cross_entropy
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 __all__ = [
@@ -24,9 +25,13 @@ __all__ = [
     "ActionPrior",
     "BoltzmannPrior",
     "ClipPPOPriorLoss",
+    "CoeffScheduler",
+    "CosineSchedule",
     "GridWorldEnv",
     "GridWorlds",
+    "LinearSchedule",
     "MethodSpec",
+    "PiecewiseSchedule",
     "PriorBonus",
     "PriorLogProb",
     "PriorWeight",
