@@ -12,10 +12,10 @@ from omegaconf import MISSING
 
 from recipes.checks import refuse_unknown_keys, require_compiler
 from recipes.loggers import LOGGERS, require_logger
+from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior, read_manifest
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
-from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.methods import get_method
 
 __all__ = ["MujocoConfig", "check"]

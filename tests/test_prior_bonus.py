@@ -138,7 +138,7 @@ def test_a_relative_bonus_that_means_nothing_is_refused(batch: TensorDict) -> No
         PriorBonus(relative=True)
     with pytest.raises(ValueError, match="got 'current' and 'policy'"):
         PriorBonus(shift="current", relative=True, centering="policy")
-    with pytest.raises(KeyError, match="'action_log_prob'.*must return its log-prob"):
+    with pytest.raises(KeyError, match=r"'action_log_prob'.*must return its log-prob"):
         PriorBonus(shift="current", relative=True)(batch)
 
 

@@ -148,7 +148,7 @@ def test_integers_which_would_round_are_refused():
 
 
 def test_a_coefficient_that_is_not_there_is_named_beside_those_that_are():
-    with pytest.raises(AttributeError, match="no coefficient 'beta'; it has .*aux_coeff"):
+    with pytest.raises(AttributeError, match=r"no coefficient 'beta'; it has .*aux_coeff"):
         CoeffScheduler(kickstart(), "beta", ANNEAL)
 
 

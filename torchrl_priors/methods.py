@@ -50,9 +50,9 @@ METHODS: dict[str, MethodSpec] = {
     # beyond the paper
     "kickstart": MethodSpec(bonus="none", auxiliary=True, adaptive=False),
     "aligned": MethodSpec(bonus="none", auxiliary=True, adaptive=True, weight_target="advantage"),
-    # the field's baselines: Schmitt et al., "Kickstarting Deep Reinforcement Learning" (2018), with a schedule by hand in
-    # place of population-based training; and the KL penalty in the reward of KL-regularised RL, e.g. Teh et al.,
-    # "Distral" (2017), Galashov et al., "Information asymmetry in KL-regularized RL" (2019)
+    # the field's baselines: Schmitt et al., "Kickstarting Deep Reinforcement Learning" (2018), with a schedule in place
+    # of population-based training; and the KL penalty in the reward of KL-regularised RL, e.g. Teh et al., "Distral"
+    # (2017), Galashov et al., "Information asymmetry in KL-regularized RL" (2019)
     "annealed_kickstart": MethodSpec(
         bonus="none", auxiliary=True, adaptive=False, cross_entropy="teacher", annealed=True
     ),
