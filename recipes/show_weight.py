@@ -18,6 +18,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 from tqdm import tqdm
 
+from recipes.checks import refuse_unknown_keys
 from recipes.gridworld import student_config, world_sampler
 from recipes.report_runs import is_gridworld
 from torchrl_priors import plots
@@ -64,6 +65,7 @@ def show(cfg: ShowConfig) -> list[Path]:
         ValueError: there is no such run, or it has no learned weight, or a setting is out of range.
         OSError: something cannot be read or written.
     """
+    refuse_unknown_keys(cfg)
     folder = Path(cfg.run)
     if not (folder / "config.yaml").is_file():
         raise ValueError(f"run={folder}: no run or study is there (it would have a config.yaml).")

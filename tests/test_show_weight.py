@@ -70,6 +70,7 @@ def test_maps_of_a_study_are_made_from_its_configuration_alone(tmp_path):
         ("gridworld.method=kickstart", "gridworld.method=kickstart: it has no learned weight"),
         ("gridworld.points=[0]", "gridworld.points=[0]"),
         ("seed=2", "has worlds 0 to 1"),
+        ("+foo=1", "foo: there is no such key"),
         ("run=nowhere", "run=nowhere: no run or study is there"),
     ],
 )
