@@ -23,6 +23,7 @@ from recipes import gridworld_report
 from recipes.gridworld_config import GridworldConfig, check
 from recipes.launchers import fail
 from recipes.runs import RunFolder, digest
+from recipes.schedule_config import applies, make_schedule, without_idle
 from recipes.workers import run_all
 from torchrl_priors.envs import GridMaps, GridWorlds, sample_worlds
 from torchrl_priors.random import derive_key
@@ -48,6 +49,7 @@ def open_folder(cfg: GridworldConfig) -> RunFolder:
     """The folder of this configuration's results."""
     plain: Any = OmegaConf.to_container(cfg, resolve=True)
     matters = {key: value for key, value in plain.items() if key not in _INCIDENTAL}
+    matters = without_idle(matters, cfg.schedule, cfg.methods)
     path = Path(cfg.out or f"outputs/gridworld/{cfg.name}-{digest(matters)}")
     return RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True))
 
@@ -89,6 +91,29 @@ def teachers(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
     return folder.arrays("teachers", compute)
 
 
+def student_config(cfg: GridworldConfig) -> StudentConfig:
+    """How students learn."""
+    rates, points, interval = cfg.student.lr_weight, cfg.evaluation.points, cfg.evaluation.interval
+    annealed = any(applies(cfg.schedule, method) for method in cfg.methods)
+    return StudentConfig(
+        hyper=Hyper(
+            gamma=cfg.student.gamma,
+            lr=cfg.student.lr,
+            noise=cfg.world.noise,
+            end_prob=cfg.world.end_prob,
+            eval_interval=interval,
+            eval_points=points,
+            schedule=make_schedule(cfg.schedule, points * interval) if annealed else None,
+        ),
+        lr_weight={"td": rates.shaped if cfg.td_error == "shaped" else rates.original, "advantage": rates.advantage},
+        td_error=cfg.td_error,
+        bonus_coeff=cfg.student.bonus_coeff,
+        aux_coeff=cfg.student.aux_coeff,
+        temperature=cfg.teacher.temperature,
+        anneal_all=cfg.schedule.methods == "all",
+    )
+
+
 @dataclass(frozen=True)
 class Block:
     """Some worlds of a study, whose students are trained as one batch and kept in one file."""
@@ -107,22 +132,6 @@ def train_block(block: Block, progress: Callable[[int], Any]) -> None:
 def _train(block: Block, progress: Callable[[int], Any]) -> np.ndarray:
     cfg = block.cfg
     taught = block.folder.arrays("teachers")
-    rates = cfg.student.lr_weight
-    config = StudentConfig(
-        hyper=Hyper(
-            gamma=cfg.student.gamma,
-            lr=cfg.student.lr,
-            noise=cfg.world.noise,
-            end_prob=cfg.world.end_prob,
-            eval_interval=cfg.evaluation.interval,
-            eval_points=cfg.evaluation.points,
-        ),
-        lr_weight={"td": rates.shaped if cfg.td_error == "shaped" else rates.original, "advantage": rates.advantage},
-        td_error=cfg.td_error,
-        bonus_coeff=cfg.student.bonus_coeff,
-        aux_coeff=cfg.student.aux_coeff,
-        temperature=cfg.teacher.temperature,
-    )
     seeds, q, visited = (
         torch.from_numpy(taught[name][block.worlds]).to(cfg.device) for name in ("seed", "q", "visited")
     )
@@ -133,7 +142,7 @@ def _train(block: Block, progress: Callable[[int], Any]) -> np.ndarray:
         q,
         {count: sample_degraded(q, visited, seeds, count, cfg.teacher.temperature) for count in counts},
         runs_of(cfg.methods, cfg.priors),
-        config,
+        student_config(cfg),
         lanes=cfg.lanes,
         compile=cfg.compile,
         progress=progress,

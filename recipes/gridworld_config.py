@@ -10,6 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from recipes.checks import refuse_unknown_keys, require_compiler
+from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.methods import get_method
 from torchrl_priors.tabular.advice import parse_prior
 
@@ -89,6 +90,7 @@ class GridworldConfig:
     world: World = field(default_factory=World)
     teacher: Teacher = field(default_factory=Teacher)
     student: Student = field(default_factory=Student)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     evaluation: Evaluation = field(default_factory=Evaluation)
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
     device: str = MISSING
@@ -124,6 +126,7 @@ def check(cfg: GridworldConfig) -> None:
                 raise ValueError(f"{key}={list(names)}: {error}") from None
     _require("none" in cfg.methods, "methods", list(cfg.methods), "none among them: area ratios compare with it")
     _require(cfg.td_error in ("original", "shaped"), "td_error", cfg.td_error, "original or shaped")
+    check_schedule(cfg.schedule)
     positive = {
         "worlds": cfg.worlds,
         "teacher.steps": cfg.teacher.steps,

@@ -28,7 +28,17 @@ __all__ = ["write"]
 
 _PAPER = Path(__file__).parent / "data" / "paper_area_ratio.csv"
 #: Pairs of methods worth a direct comparison on the same worlds.
-_COMPARISONS = (("aer", "er"), ("ae2r", "e2r"), ("aligned", "ae2r"), ("aligned", "kickstart"), ("kickstart", "e2r"))
+_COMPARISONS = (
+    ("aer", "er"),
+    ("ae2r", "e2r"),
+    ("aligned", "ae2r"),
+    ("aligned", "kickstart"),
+    ("kickstart", "e2r"),
+    ("aligned", "annealed_kickstart"),
+    ("aligned", "kl_penalty"),
+    ("ae2r", "annealed_kickstart"),
+    ("ae2r", "kl_penalty"),
+)
 
 
 class Episodes:
@@ -148,6 +158,19 @@ def curve_table(cfg: GridworldConfig, curves: dict[str, dict[str, ConfidenceInte
     return pd.concat(frames)
 
 
+def prior_weight_curves(cfg: GridworldConfig, data: Episodes) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Mean prior weight by visit at each evaluation point, at degraded and at other states, by prior and method."""
+    curves: dict[str, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
+    for prior in cfg.priors:
+        for method in cfg.methods:
+            if prior.startswith("structural") and get_method(method).adaptive:
+                sums = {name: data.of(method, prior, name).sum(0) for name in LOG_FIELDS[2:]}
+                with np.errstate(invalid="ignore"):  # no visit: NaN, which is not drawn
+                    means = (sums["w_degraded"] / sums["n_degraded"], sums["w_other"] / sums["n_other"])
+                curves.setdefault(prior, {})[method] = means
+    return curves
+
+
 def figures(
     cfg: GridworldConfig, data: Episodes, ratios: pd.DataFrame, curves: dict[str, dict[str, ConfidenceInterval]]
 ) -> dict[str, Figure]:
@@ -193,6 +216,9 @@ def write(
     pictures = {"world": GridWorldEnv(worlds[:1]).render()}
     if len(ratios):
         pictures |= figures(cfg, data, ratios, curves)
+    if by_state := prior_weight_curves(cfg, data):
+        steps = np.arange(1, cfg.evaluation.points + 1) * cfg.evaluation.interval
+        pictures["prior_weights"] = plots.weight_curves(by_state, steps)
     for name, figure in pictures.items():
         written += plots.save_figure(figure, folder.path / name)
 

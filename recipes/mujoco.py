@@ -23,10 +23,12 @@ from torchrl.objectives.value import GAE
 
 from recipes.mujoco_config import MujocoConfig, check
 from recipes.mujoco_run import Run, supervise
+from recipes.schedule_config import applies, make_schedule
 from torchrl_priors import (
     ActionPrior,
     AVECMixin,
     ClipPPOPriorLoss,
+    CoeffScheduler,
     PriorBonus,
     PriorLogProb,
     PriorTrust,
@@ -146,6 +148,25 @@ class Agent(nn.Module):
         networks = {"actor": self.actor, "critic": self.critic, "weight": self.weight, "raw_critic": self.raw_critic}
         return {name: network for name, network in networks.items() if network is not None and [*network.parameters()]}
 
+    def schedulers(self) -> dict[str, CoeffScheduler]:
+        """What anneals the method's coefficients, by name; nothing where they are constant."""
+        cfg = self.cfg
+        if not applies(cfg.schedule, cfg.method):
+            return {}
+        prior_loss: Any = self.loss.prior_loss
+        coefficients: dict[str, tuple[nn.Module, str]] = {}
+        if self.spec.auxiliary:
+            coefficients["aux_coeff"] = (prior_loss, "aux_coeff")
+        if self.spec.bonus != "none":  # of the transform, and of the prior weight's loss
+            coefficients["bonus_coeff"] = (self.transforms[-1], "bonus_coeff")
+            coefficients["loss_bonus_coeff"] = (prior_loss, "bonus_coeff")
+        return {
+            name: CoeffScheduler(
+                module, buffer, make_schedule(cfg.schedule, cfg.total_frames, float(module.get_buffer(buffer)))
+            )
+            for name, (module, buffer) in coefficients.items()
+        }
+
     @torch.no_grad()
     def prepare(self, rollout: TensorDictBase) -> TensorDictBase:
         """Score the rollout under the prior, shape its rewards, estimate advantages: once, for all epochs."""
@@ -218,7 +239,10 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         normalizer=agent.normalizer,
         seed=cfg.seed,
     )
+    schedulers = agent.schedulers()
     run.register(agent=agent, optimizer=optimise.adam, collector=collector)
+    for scheduler in schedulers.values():
+        scheduler.step(collector.frames)
     start, first = time.perf_counter(), collector.frames
     for rollout in collector:
         metrics = optimise(agent.prepare(rollout))
@@ -232,7 +256,10 @@ def train(cfg: MujocoConfig, run: Run) -> None:
                 metrics[f"prior_weight_q{quantile:02d}"] = weight.quantile(quantile / 100)
         if isinstance(agent.weight, PriorTrust):
             metrics["prior_trust"] = agent.weight.mean_trust
+        metrics |= {name: torch.tensor(scheduler.value) for name, scheduler in schedulers.items()}
         run.log(collector.frames, metrics, weight)
+        for scheduler in schedulers.values():
+            scheduler.step(collector.frames)
         if run.evaluation_is_due(collector.frames):
             result = evaluate(
                 test_env,

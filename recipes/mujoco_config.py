@@ -12,6 +12,7 @@ from omegaconf import MISSING
 
 from recipes.checks import refuse_unknown_keys, require_compiler
 from recipes.loggers import LOGGERS, require_logger
+from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior, read_manifest
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
@@ -103,6 +104,7 @@ class MujocoConfig:
     centering: str = MISSING
     bonus_coeff: float = MISSING
     aux_coeff: float = MISSING
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     ppo: PPO = field(default_factory=PPO)
     evaluation: Evaluation = field(default_factory=Evaluation)
     checkpoint: Checkpoints = field(default_factory=Checkpoints)
@@ -145,6 +147,9 @@ def check(cfg: MujocoConfig) -> None:
     }
     for key, (choice, allowed) in options.items():
         _require(choice in allowed, key, choice, f"one of {', '.join(allowed)}")
+    check_schedule(cfg.schedule)
+    if get_method(cfg.method).relative:
+        _require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
     positive = {
         "total_frames": cfg.total_frames,
         "env.num_envs": cfg.env.num_envs,

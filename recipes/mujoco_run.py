@@ -22,6 +22,7 @@ from recipes.launchers import fail, in_sweep
 from recipes.loggers import RunLogger
 from recipes.mujoco_config import MujocoConfig
 from recipes.runs import RunFolder, digest
+from recipes.schedule_config import without_idle
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors.evaluation import Evaluation
 
@@ -45,6 +46,7 @@ class Run:
     def __init__(self, cfg: MujocoConfig) -> None:
         plain: Any = OmegaConf.to_container(cfg, resolve=True)
         matters = {key: value for key, value in plain.items() if key not in _INCIDENTAL}
+        matters = without_idle(matters, cfg.schedule, [cfg.method])
         if cfg.prior.path is not None:
             matters["prior"] |= {"path": Path(cfg.prior.path).name, "sha256": _sha256(Path(cfg.prior.path))}
         env = f"{cfg.env.id}-{cfg.env.version}"

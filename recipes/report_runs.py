@@ -235,6 +235,8 @@ def _method_settings(run: Run, cfg: ReportConfig) -> dict[str, Any]:
     patterns += cfg.with_prior if run.method == "none" else []
     patterns += cfg.with_bonus if spec.bonus == "none" else []
     patterns += [] if spec.adaptive else cfg.with_weight
+    annealed = run.method != "none" and (spec.annealed or run.settings.get("schedule.methods") == "all")
+    patterns += [] if annealed else ["schedule.*"]
     patterns.append("method")
     return {
         key: value for key, value in run.settings.items() if not any(fnmatchcase(key, pattern) for pattern in patterns)

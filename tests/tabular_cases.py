@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_priors.envs import GridMaps, GridWorlds
 from torchrl_priors.envs.gridworld import transition
 from torchrl_priors.random import uniform
+from torchrl_priors.schedules import CosineSchedule
 from torchrl_priors.tabular import Hyper, StudentConfig, advice_tables
 from torchrl_priors.tabular import actor_critic as ac
 from torchrl_priors.tabular.study import build_runs
@@ -86,7 +87,13 @@ class Study:
         generator = torch.Generator().manual_seed(5)
         states = 36
         hyper = Hyper(
-            gamma=0.95, lr=0.1, noise=0.1, end_prob=end_prob, eval_interval=eval_interval, eval_points=eval_points
+            gamma=0.95,
+            lr=0.1,
+            noise=0.1,
+            end_prob=end_prob,
+            eval_interval=eval_interval,
+            eval_points=eval_points,
+            schedule=CosineSchedule(1.0, 0.2, frames=40),
         )
         return cls(
             worlds=drawn_worlds(worlds),
@@ -121,6 +128,7 @@ class Step(NamedTuple):
     done: Tensor
     next_state: Tensor
     degraded: Tensor
+    steps: Tensor
     before: ac.Carry
     after: ac.Carry
     records: Tensor
@@ -148,6 +156,7 @@ def play(study: Study, steps: int, *, random_tables: bool = False) -> tuple[Tens
         )
         after = ac.advance(clock, maps, advice, runs, carry, records, log, hyper)
         state, next_state = maps.state[carry.position].long(), maps.state[position].long()
-        history.append(Step(state, carry.action, reward, done, next_state, degraded, carry, after, records.clone()))
+        facts = (state, carry.action, reward, done, next_state, degraded, carry.steps)
+        history.append(Step(*facts, carry, after, records.clone()))
         carry, degraded = after, degrade < runs.degrade_prob
     return first, history, log, runs

@@ -116,8 +116,8 @@ class PlainStudent:
                     ):
                         episode[name] += amount
                 else:
+                    self.learn(state, action, advice, reward, following, learned)
                     learned += 1
-                    self.learn(state, action, advice, reward, following)
                 if not done:
                     state, action, advice = following
             if greedy:
@@ -128,11 +128,14 @@ class PlainStudent:
                 self.weight_logit[state] -= self.config.lr_weight[self.spec.weight_target] * gradient
         return learned
 
-    def learn(self, state: int, action: int, advice: np.ndarray, reward: float, following: tuple | None) -> None:
+    def learn(
+        self, state: int, action: int, advice: np.ndarray, reward: float, following: tuple | None, learned: int
+    ) -> None:
         config, spec, hyper = self.config, self.spec, self.config.hyper
-        weight, bonus = self.weight(state), 0.0
+        weight, bonus, policy = self.weight(state), 0.0, softmax(self.logits[state])
         if spec.bonus == "current":
-            bonus = config.bonus_coeff * weight * advice[action]
+            own = math.log(policy[action]) if spec.relative else 0.0
+            bonus = config.bonus_coeff * weight * (advice[action] - own)
         if spec.bonus == "next" and following:
             bonus = config.bonus_coeff * self.weight(following[0]) * following[2][following[1]]
 
@@ -143,11 +146,14 @@ class PlainStudent:
         self.value[state] += hyper.lr * delta
         self.raw_value[state] += hyper.lr * raw_delta
 
-        policy = softmax(self.logits[state])
         self.policy_gradient[state] += delta * (policy - np.eye(4)[action])
         cross_entropy = -(policy * advice).sum()
         if spec.auxiliary:
-            self.policy_gradient[state] += config.aux_coeff * weight * policy * (-advice - cross_entropy)
+            pull = policy * (-advice - cross_entropy)
+            if spec.cross_entropy == "teacher":
+                pull = policy - np.exp(advice)
+            annealed = 0.2 + 0.8 * (1 + math.cos(math.pi * min(learned / 40, 1))) / 2 if spec.annealed else 1.0
+            self.policy_gradient[state] += annealed * config.aux_coeff * weight * pull
         if not spec.adaptive:
             return
         if spec.weight_target == "advantage":

@@ -19,6 +19,8 @@ from torchrl_priors.methods import METHODS, MethodSpec, get_method
         ("ae2r", "next", True, True, "td"),
         ("kickstart", "none", True, False, "td"),
         ("aligned", "none", True, True, "advantage"),
+        ("annealed_kickstart", "none", True, False, "td"),
+        ("kl_penalty", "current", False, False, "td"),
     ],
 )
 def test_a_method_is_its_row_of_the_table(
@@ -34,7 +36,8 @@ def test_a_method_is_its_row_of_the_table(
 
 
 def test_there_is_no_method_outside_the_table() -> None:
-    assert set(METHODS) == {"none", "er", "e2r", "aer", "ae2r", "kickstart", "aligned"}
+    papers_and_ours = {"none", "er", "e2r", "aer", "ae2r", "kickstart", "aligned"}
+    assert set(METHODS) == papers_and_ours | {"annealed_kickstart", "kl_penalty"}
 
 
 @pytest.mark.parametrize(("fixed", "adaptive"), [("er", "aer"), ("e2r", "ae2r")])
@@ -44,6 +47,20 @@ def test_the_adaptive_methods_differ_by_the_weight_alone(fixed: str, adaptive: s
 
 def test_aligned_is_kickstart_with_a_weight_learned_from_the_advantage() -> None:
     assert replace(get_method("kickstart"), adaptive=True, weight_target="advantage") == get_method("aligned")
+
+
+def test_the_fields_baselines_are_relatives_of_kickstart_and_er() -> None:
+    expected = replace(get_method("kickstart"), cross_entropy="teacher", annealed=True)
+    assert get_method("annealed_kickstart") == expected
+    assert get_method("kl_penalty") == replace(get_method("er"), relative=True)
+    assert [name for name in METHODS if METHODS[name].annealed] == ["annealed_kickstart"]
+
+
+@pytest.mark.parametrize("settings", [("next", False), ("none", False), ("current", True)])
+def test_a_relative_bonus_is_the_current_one_without_a_weight(settings: tuple) -> None:
+    bonus, adaptive = settings
+    with pytest.raises(ValueError, match="relative bonus"):
+        MethodSpec(bonus=bonus, auxiliary=False, adaptive=adaptive, relative=True)
 
 
 @pytest.mark.parametrize("name", ["AE2R", "", "ppo"])

@@ -128,6 +128,27 @@ def test_aligned_by_hand(two_states):
     torch.testing.assert_close(losses["loss_prior_weight"], expected)
 
 
+def test_annealed_kickstart_averages_over_the_teachers_actions_by_hand(two_states):
+    networks, data = two_states
+    loss = AE2RLoss(networks["actor_network"], networks["prior"], method="annealed_kickstart", reduction="none")
+    losses = loss(data)
+    # at s0: -(1/4 log 1/2 + 3/4 log 1/2) = log 2; at s1: -(1/2 log 3/4 + 1/2 log 1/4)
+    expected = torch.tensor([math.log(2.0), -(math.log(0.75) + math.log(0.25)) / 2])
+    torch.testing.assert_close(losses["loss_prior"], expected)
+    torch.testing.assert_close(losses["prior_cross_entropy"], expected.mean())
+    losses["loss_prior"].sum().backward()
+    # by the logits of a state: pi - pi0
+    (gradient,) = [value.grad for name, value in loss.named_parameters() if "actor" in name and value.grad is not None]
+    torch.testing.assert_close(gradient, torch.tensor([[0.25, 0.25], [-0.25, -0.25]]))
+
+
+def test_the_teachers_cross_entropy_of_gaussians_pulls_the_spread_to_the_teachers():
+    loss, data = make_loss("annealed_kickstart", kind="normal"), make_batch("normal")
+    student, teacher = (net.get_dist(data.copy()) for net in (loss.actor_network, loss.prior))
+    expected = torch.distributions.kl_divergence(teacher, student) + teacher.entropy()
+    torch.testing.assert_close(loss(data)["loss_prior"], expected.mean())
+
+
 def test_centred_bonus_by_hand(two_states):
     networks, data = two_states
     losses = AE2RLoss(**networks, gamma=0.5, centering="policy", bonus_coeff=2.0, reduction="none")(data)
@@ -168,7 +189,10 @@ def loop(loss, data, spec, td_error, weight_target, centering, coeff):
             else:
                 y, signal, at = v - target, coeff * log_prob_c, w
             if spec.auxiliary:
-                out["loss_prior"].append(3.0 * (w if spec.adaptive else 1.0) * entropy)
+                pull = entropy
+                if spec.cross_entropy == "teacher":
+                    pull = -sum(math.exp(q) * p for p, q in zip(logits.tolist(), prior_logits.tolist(), strict=True))
+                out["loss_prior"].append(3.0 * (w if spec.adaptive else 1.0) * pull)
             if spec.adaptive:
                 out["loss_prior_weight"].append(5.0 * (y - at * signal) ** 2)
                 if td_error == "original":

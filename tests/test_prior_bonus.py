@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from trajectories import STATES, actor, prior, trajectories
+from trajectories import ACTIONS, ACTOR_LOGITS, PRIOR_LOGITS, STATES, actor, prior, trajectories
 
 from torchrl_priors.methods import METHODS
 from torchrl_priors.prior_weight import PriorWeight
@@ -102,6 +102,7 @@ def test_coefficient_can_be_scheduled(batch: TensorDict) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_has_its_bonus(batch: TensorDict, weight: PriorWeight, method: str) -> None:
+    batch["action_log_prob"] = own = -torch.rand(batch.shape)
     bonus = PriorBonus.from_method(method, weight)(batch)["next", "prior_bonus"]
     following, current = batch["next", "prior_log_prob"], batch["prior_log_prob"]
     expected = {
@@ -109,8 +110,36 @@ def test_every_method_has_its_bonus(batch: TensorDict, weight: PriorWeight, meth
         "e2r": following,
         "aer": at(weight, batch["state"]) * current,
         "ae2r": at(weight, batch["next", "state"]) * following,
+        "kl_penalty": current - own.unsqueeze(-1),
     }.get(method, torch.zeros_like(current))
     torch.testing.assert_close(bonus, expected)
+
+
+@pytest.mark.parametrize("trailing", [False, True])
+def test_a_relative_bonus_is_minus_the_divergence_in_the_mean(batch: TensorDict, trailing: bool) -> None:
+    log_prob = ACTOR_LOGITS[batch["state"], batch["action"]]
+    batch["action_log_prob"] = log_prob.unsqueeze(-1) if trailing else log_prob
+    bonus = PriorBonus.from_method("kl_penalty")(batch)["next", "prior_bonus"]
+    torch.testing.assert_close(bonus, batch["prior_log_prob"] - log_prob.unsqueeze(-1))
+    # over all states and actions, by hand: the sum over the student's actions is -KL(pi || pi0)
+    everything = torch.cartesian_prod(torch.arange(STATES), torch.arange(ACTIONS))
+    state, action = everything.unbind(-1)
+    full = trajectories(len(state))
+    full["state"], full["action"] = state, action
+    full["prior_log_prob"] = PRIOR_LOGITS[state, action].unsqueeze(-1)
+    full["action_log_prob"] = ACTOR_LOGITS[state, action]
+    bonus = PriorBonus(shift="current", relative=True)(full)["next", "prior_bonus"].view(STATES, ACTIONS)
+    divergence = (ACTOR_LOGITS.exp() * (ACTOR_LOGITS - PRIOR_LOGITS)).sum(-1)
+    torch.testing.assert_close((ACTOR_LOGITS.exp() * bonus).sum(-1), -divergence)
+
+
+def test_a_relative_bonus_that_means_nothing_is_refused(batch: TensorDict) -> None:
+    with pytest.raises(ValueError, match="needs shift='current' and centering='none', got 'next'"):
+        PriorBonus(relative=True)
+    with pytest.raises(ValueError, match="got 'current' and 'policy'"):
+        PriorBonus(shift="current", relative=True, centering="policy")
+    with pytest.raises(KeyError, match=r"'action_log_prob'.*must return its log-prob"):
+        PriorBonus(shift="current", relative=True)(batch)
 
 
 def test_methods_without_a_bonus_need_no_log_probs() -> None:

@@ -280,12 +280,11 @@ def test_damaged_block_is_named_and_nothing_is_lost(five, tmp_path, capfd):
 
 
 def test_default_folder_differs_for_each_configuration(tmp_path):
+    plain = {"name": "small", "out": None, "lanes": 1, "methods": ["none"], "schedule": {"methods": "annealed"}}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         paths = [
-            open_folder(
-                OmegaConf.create({"name": "small", "out": None, "lanes": 1, "seed": seed, "workers": workers})
-            ).path
+            open_folder(OmegaConf.create({**plain, "seed": seed, "workers": workers})).path
             for seed, workers in ((0, 1), (0, 2), (1, 1))
         ]
     assert paths[0] == paths[1]

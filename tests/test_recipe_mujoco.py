@@ -121,6 +121,48 @@ def test_a_killed_process_continues_where_it_was(tmp_path):
     assert (out / "eval.csv").read_bytes() == (tmp_path / "whole" / "eval.csv").read_bytes()
 
 
+def test_an_annealed_coefficient_is_logged_and_goes_to_its_end(teacher, tmp_path):
+    out = run(tmp_path, "method=annealed_kickstart", f"prior.path={teacher}")
+    metrics = pd.read_csv(out / "metrics.csv")
+    assert metrics["aux_coeff"].tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0])  # to 0 at half of 256 frames
+    assert (metrics["loss_prior"] / metrics["prior_cross_entropy"]).tolist() == pytest.approx([1.0, 0.5, 0.0, 0.0])
+
+
+def test_any_method_can_be_annealed_bonus_and_loss_alike(teacher, tmp_path):
+    schedule = ["schedule.methods=all", "schedule.shape=piecewise", "schedule.points=[[0.25,1],[0.75,0.5]]"]
+    out = run(tmp_path, "method=ae2r", f"prior.path={teacher}", "bonus_coeff=0.8", *schedule)
+    metrics = pd.read_csv(out / "metrics.csv")
+    assert metrics["aux_coeff"].tolist() == pytest.approx([1.0, 1.0, 0.75, 0.5])
+    for name in ("bonus_coeff", "loss_bonus_coeff"):
+        assert metrics[name].tolist() == pytest.approx([0.8, 0.8, 0.6, 0.4])
+
+
+def test_an_annealed_run_goes_on_at_the_coefficient_it_stopped_at(teacher, tmp_path, monkeypatch):
+    options = ("method=e2r", f"prior.path={teacher}", "schedule.methods=all", "schedule.shape=cosine")
+    whole, log = run(tmp_path / "whole", *options), recipe.Run.log
+
+    def stopping(self, frames, *args):
+        log(self, frames, *args)
+        if frames == 192:
+            raise Interrupted
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe.Run, "log", stopping)
+        with pytest.raises(Interrupted):
+            run(tmp_path / "stopped", *options)
+    run(tmp_path / "stopped", *options)
+    names = ["eval.csv", "policy.safetensors"]
+    assert [(tmp_path / "stopped" / n).read_bytes() for n in names] == [(whole / n).read_bytes() for n in names]
+
+
+def test_a_schedule_that_is_not_used_is_no_part_of_a_runs_identity(teacher, tmp_path):
+    out = run(tmp_path, "method=e2r", f"prior.path={teacher}", "total_frames=64")
+    assert '"schedule"' not in (out / "config.json").read_text()
+    run(out, "method=e2r", f"prior.path={teacher}", "total_frames=64", "schedule.until=0.3")  # finished already
+    with pytest.raises(SystemExit, match="schedule"):
+        run(out, "method=e2r", f"prior.path={teacher}", "total_frames=64", "schedule.methods=all")
+
+
 def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
     monkeypatch.setattr(recipe, "Agent", None)  # would fail if it were
     run(teacher.parent)
@@ -143,6 +185,11 @@ def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
         ("+ppo.foo=1", "ppo.foo: there is no such key"),
         ("env.version=v99", "env=Hopper-v99"),
         ("+env.kwargs.foo=1", "foo=1"),
+        ("schedule.shape=square", "schedule.shape=square: expected one of linear, cosine, piecewise"),
+        ("schedule.until=0", "schedule.until=0"),
+        ("schedule={shape:piecewise}", "schedule.points=[]"),
+        ("schedule={shape:piecewise,points:[[0.5,1],[0.5,0]]}", "at increasing shares"),
+        ("schedule={shape:piecewise,points:[1,2]}", "expected pairs"),
     ],
 )
 def test_bad_input_is_refused_by_name_before_anything_is_written(override, message, tmp_path):

@@ -95,6 +95,20 @@ def test_settings_without_effect_on_a_method_do_not_split_it(tmp_path: Path) -> 
     assert study_of(tmp_path).labels == ["none", "e2r", "kickstart"]
 
 
+def test_a_schedule_tells_runs_apart_only_where_it_applies(tmp_path: Path) -> None:
+    schedules = [{}, {"schedule": {"methods": "annealed", "end": 0.5}}]  # the first is older than schedules
+    for seed, settings in enumerate(schedules):
+        for method in ("none", "e2r"):
+            write_run(tmp_path / f"{method}{seed}", method=method, seed=seed, config=settings)
+    assert study_of(tmp_path).labels == ["none", "e2r"]
+    for end in (0.0, 0.5):
+        config = {"schedule": {"methods": "all", "end": end}}
+        write_run(tmp_path / f"e2r-{end}", method="e2r", seed=2, config=config)
+    told = [label for label in study_of(tmp_path).labels if label.startswith("e2r ")]
+    assert len(told) == 3
+    assert any("end=0.5" in label for label in told)
+
+
 def test_a_variant_run_in_one_environment_only_is_named_alike_in_the_others(tmp_path: Path) -> None:
     write_run(tmp_path / "a", "Hopper", "ae2r", config={"weight": {"lr_coeff": 1.0}})
     write_run(tmp_path / "b", "Hopper", "ae2r", config={"weight": {"lr_coeff": 0.3}})

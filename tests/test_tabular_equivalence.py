@@ -19,7 +19,8 @@ from torchrl_priors.methods import METHODS, get_method
 from torchrl_priors.objectives import AE2RLoss
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import BoltzmannPrior
-from torchrl_priors.tabular import runs_of
+from torchrl_priors.schedules import CoeffScheduler, CosineSchedule
+from torchrl_priors.tabular import StudentConfig, runs_of
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 PRIORS = ["expert", "random_30", "structural_3"]
@@ -46,12 +47,13 @@ def episodes_of(history: list[Step], row: int) -> list[list[Step]]:
 
 def as_batch(steps: list[Step], row: int) -> TensorDict:
     """An episode as a rollout would give it, and whose advice each step saw."""
-    fields = {name: torch.stack([getattr(step, name)[row] for step in steps]) for name in Step._fields[:6]}
+    fields = {name: torch.stack([getattr(step, name)[row] for step in steps]) for name in Step._fields[:7]}
     done = fields["done"].unsqueeze(-1)
     return TensorDict(
         {
             "state": fields["state"],
             "action": fields["action"],
+            "steps": fields["steps"],
             "prior": {"degraded": fields["degraded"].unsqueeze(-1)},
             "next": {
                 "state": fields["next_state"],
@@ -109,6 +111,9 @@ class Student:
             gamma=config.hyper.gamma,
             reduction="sum",
         )
+        self.actor, self.schedule = actor, None
+        if self.spec.annealed:
+            self.schedule = CoeffScheduler(self.prior_loss, "aux_coeff", self.annealing(config))
         # The gradient of a squared error is twice that of a TD(0) step.
         self.critics = torch.optim.SGD([self.value, self.raw_value], lr=config.hyper.lr / 2)
         self.actor_and_weight = torch.optim.SGD(
@@ -118,11 +123,21 @@ class Student:
             ]
         )
 
+    @staticmethod
+    def annealing(config: StudentConfig) -> CosineSchedule:
+        schedule = config.hyper.schedule
+        assert isinstance(schedule, CosineSchedule)
+        return CosineSchedule(config.aux_coeff * schedule.start, config.aux_coeff * schedule.end, schedule.frames)
+
     def learn(self, episode: TensorDict) -> None:
         """One whole episode: critics online, actor and prior weight at its end."""
         self.actor_and_weight.zero_grad()
+        with torch.no_grad():  # the policy is the same during an episode
+            episode["action_log_prob"] = self.actor.get_dist(episode.copy()).log_prob(episode["action"])
         for step in self.bonus(self.log_prob(episode)).split(1):
             self.critics.zero_grad()
+            if self.schedule is not None:
+                self.schedule.step(int(step["steps"]))
             with torch.no_grad():
                 self.td_error(step)
             policy, prior = self.policy_loss(step), self.prior_loss(step)

@@ -60,7 +60,8 @@ def two_threads() -> Iterator[None]:
 
 def test_runs_of_a_study_differ(whole):
     logs = torch.stack(list(whole.values())).flatten(1)
-    assert len(logs.unique(dim=0)) > 0.9 * len(logs)
+    # where a reward lies beside the start, methods without a weight to tell them apart end in the same greedy step
+    assert len(logs.unique(dim=0)) > 0.8 * len(logs)
     assert (logs.view(-1, 3, 8)[..., 1] >= 1).all()  # every evaluation episode took place
 
 

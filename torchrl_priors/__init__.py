@@ -17,6 +17,7 @@ from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, Val
 from torchrl_priors.prior_trust import PriorTrust, advice_evidence
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 __all__ = [
@@ -26,9 +27,13 @@ __all__ = [
     "ActionPrior",
     "BoltzmannPrior",
     "ClipPPOPriorLoss",
+    "CoeffScheduler",
+    "CosineSchedule",
     "GridWorldEnv",
     "GridWorlds",
+    "LinearSchedule",
     "MethodSpec",
+    "PiecewiseSchedule",
     "PriorBonus",
     "PriorLogProb",
     "PriorShaping",

@@ -1,4 +1,4 @@
-"""The methods by name: each is a preset of four settings, not a code path of its own."""
+"""The methods by name: each is a preset of settings, not a code path of its own."""
 
 from __future__ import annotations
 
@@ -19,12 +19,25 @@ class MethodSpec:
         adaptive: whether both are scaled by a learned prior weight w(s) (else w = 1).
         weight_target: what the prior weight regresses on: the critic's ``"td"`` error (the paper) or the
             ``"advantage"``.
+        relative: whether the bonus is relative to the student's own log-probability, log pi0(a|s) - log pi(a|s): in the
+            mean minus the divergence KL(pi || pi0). Of ``bonus="current"`` without a learned weight only.
+        cross_entropy: whose actions the auxiliary loss averages over: the ``"student"``'s, H^X(pi || pi0), or the
+            ``"teacher"``'s, H^X(pi0 || pi).
+        annealed: whether the method's coefficients are meant to go to 0 over training. Whoever runs the loop does that,
+            with a :class:`~torchrl_priors.schedules.CoeffScheduler`; losses and transforms do not read it.
     """
 
     bonus: Literal["none", "current", "next"]
     auxiliary: bool
     adaptive: bool
     weight_target: Literal["td", "advantage"] = "td"
+    relative: bool = False
+    cross_entropy: Literal["student", "teacher"] = "student"
+    annealed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.relative and (self.bonus != "current" or self.adaptive):
+            raise ValueError(f"A relative bonus is the current one, without a learned weight: got {self}.")
 
 
 METHODS: dict[str, MethodSpec] = {
@@ -37,6 +50,13 @@ METHODS: dict[str, MethodSpec] = {
     # beyond the paper
     "kickstart": MethodSpec(bonus="none", auxiliary=True, adaptive=False),
     "aligned": MethodSpec(bonus="none", auxiliary=True, adaptive=True, weight_target="advantage"),
+    # the field's baselines: Schmitt et al., "Kickstarting Deep Reinforcement Learning" (2018), with a schedule in place
+    # of population-based training; and the KL penalty in the reward of KL-regularised RL, e.g. Teh et al., "Distral"
+    # (2017), Galashov et al., "Information asymmetry in KL-regularized RL" (2019)
+    "annealed_kickstart": MethodSpec(
+        bonus="none", auxiliary=True, adaptive=False, cross_entropy="teacher", annealed=True
+    ),
+    "kl_penalty": MethodSpec(bonus="current", auxiliary=False, adaptive=False, relative=True),
 }
 
 

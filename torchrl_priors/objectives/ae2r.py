@@ -25,7 +25,7 @@ from torchrl_priors.functional import alignment, prior_bonus, prior_weight_loss,
 from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.priors import ActionPrior
 
-from .cross_entropy import cross_entropy_and_kl
+from .cross_entropy import cross_entropy, cross_entropy_and_kl
 
 __all__ = ["AE2RLoss"]
 
@@ -38,7 +38,8 @@ class AE2RLoss(LossModule):
     :math:`\pi` the student, :math:`\pi_0` the prior and :math:`\omega(s)\in[0,1]` the prior weight,
 
     * ``"loss_prior"``, :math:`c_{aux}\,\mathrm{sg}[\omega(s_t)]\,H^X_{s_t}(\pi\|\pi_0)`, which reaches the actor only;
-      being a cross-entropy and no divergence, it pulls towards the prior's best action, not to its entropy;
+      being a cross-entropy and no divergence, it pulls towards the prior's best action, not to its entropy (that of
+      ``"annealed_kickstart"`` is :math:`H^X_{s_t}(\pi_0\|\pi)`, which pulls towards the prior itself);
     * ``"loss_prior_weight"``, :math:`c_\omega\,(y - \omega(s)\,\ell)^2`, which reaches the prior weight only;
     * ``"loss_prior_critic"``, :math:`c_V\,(V(s_t) - \mathrm{sg}[R_t + \gamma(1-\mathrm{term}_t)V(s_{t+1})])^2`, which
       reaches the critic of raw rewards only (``td_error="original"``).
@@ -71,8 +72,8 @@ class AE2RLoss(LossModule):
             ``raw_advantage``, ``[*B, 1]``.
 
     Keyword Args:
-        method (str or MethodSpec): ``"none"``, ``"er"``, ``"e2r"``, ``"aer"``, ``"ae2r"``, ``"kickstart"`` or
-            ``"aligned"``. ``"none"`` and ``"er"`` have no loss here. Defaults to ``"ae2r"``.
+        method (str or MethodSpec): a key of :data:`~torchrl_priors.METHODS`. ``"none"``, ``"er"`` and ``"kl_penalty"``
+            have no loss here. Defaults to ``"ae2r"``.
         td_error (str): ``"original"`` (a critic that never sees the bonus) or ``"shaped"``. Defaults to ``"original"``.
         weight_target (str, optional): ``"td"``, ``"advantage"``, or ``"none"`` for a weight that this loss only reads.
             Defaults to ``None``: the method's.
@@ -347,9 +348,10 @@ class AE2RLoss(LossModule):
         logs: dict[str, Tensor] = {}
         weight: Tensor | None = None
         entropy: Tensor | None = None
+        auxiliary: Tensor | None = None
         if self._needs_cross_entropy:
-            entropy, logs["prior_kl"] = self._cross_entropy(tensordict, dist)
-            logs["prior_cross_entropy"] = entropy
+            entropy, auxiliary, logs["prior_kl"] = self._cross_entropy(tensordict, dist)
+            logs["prior_cross_entropy"] = auxiliary
         if self.spec.adaptive:
             delta: Tensor | None = None
             if self._has_critic:
@@ -366,8 +368,8 @@ class AE2RLoss(LossModule):
             logs["prior_weight"] = weight
             if loss_weight is not None:
                 losses["loss_prior_weight"] = self.weight_coeff * loss_weight
-        if self.spec.auxiliary and entropy is not None:
-            losses["loss_prior"] = self.aux_coeff * (entropy if weight is None else weight.detach() * entropy)
+        if self.spec.auxiliary and auxiliary is not None:
+            losses["loss_prior"] = self.aux_coeff * (auxiliary if weight is None else weight.detach() * auxiliary)
         bonus = tensordict.get(_next(self.tensor_keys.prior_bonus), None)
         if bonus is not None:
             logs["prior_bonus"] = bonus
@@ -381,8 +383,8 @@ class AE2RLoss(LossModule):
         self._clear_weakrefs(tensordict, out, "actor_network_params", "prior_weight_params", "critic_network_params")
         return out
 
-    def _cross_entropy(self, tensordict: TensorDictBase, dist: d.Distribution | None) -> tuple[Tensor, Tensor]:
-        """H^X(pi || pi0), ``[*B, 1]``, with a gradient for the actor if it is a loss, and KL(pi || pi0) without one."""
+    def _cross_entropy(self, tensordict: TensorDictBase, dist: d.Distribution | None) -> tuple[Tensor, Tensor, Tensor]:
+        """H^X(pi || pi0), that of the loss, with a gradient for the actor if it is one, and KL(pi || pi0) without."""
         with torch.no_grad():
             prior_dist = self._prior_dist(tensordict)
         with contextlib.nullcontext() if self.spec.auxiliary else torch.no_grad():
@@ -390,7 +392,9 @@ class AE2RLoss(LossModule):
                 with self._params_of("actor_network"):
                     dist = self.actor_network.get_dist(tensordict.copy())
             entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=self.num_samples)
-        return entropy.unsqueeze(-1), kl.unsqueeze(-1)
+            teacher = self.spec.cross_entropy == "teacher"
+            auxiliary = cross_entropy(prior_dist, dist, num_samples=self.num_samples) if teacher else entropy
+        return entropy.unsqueeze(-1), auxiliary.unsqueeze(-1), kl.unsqueeze(-1)
 
     def _prior_dist(self, tensordict: TensorDictBase) -> d.Distribution:
         if not self.prior_in_batch:

@@ -9,8 +9,10 @@ from torchrl_priors.plots.curves import learning_curves, performance_profiles
 from torchrl_priors.plots.grid import grid_world
 from torchrl_priors.plots.intervals import iqm_bars
 from torchrl_priors.plots.style import method_color, method_label, prior_label, save_figure
+from torchrl_priors.plots.weights import episode_weights, weight_curves, weight_maps
 
 __all__ = [
+    "episode_weights",
     "grid_world",
     "iqm_bars",
     "learning_curves",
@@ -19,4 +21,6 @@ __all__ = [
     "performance_profiles",
     "prior_label",
     "save_figure",
+    "weight_curves",
+    "weight_maps",
 ]

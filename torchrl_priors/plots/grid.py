@@ -38,6 +38,7 @@ def grid_world(
     degraded: Any = None,
     title: str | None = None,
     legend: bool | None = None,
+    colorbar: bool = True,
     ax: Axes | None = None,
 ) -> Figure:
     """Draw a gridworld: start blue, walls black, terminal cells green, rewards as numbers; and overlays on it.
@@ -54,6 +55,7 @@ def grid_world(
         degraded: bool, ``[H, W]``: cells where the prior is degraded, hatched and framed in red.
         title (str, optional): printed above.
         legend (bool, optional): whether to explain the colours below. By default, in a figure of its own only.
+        colorbar (bool): whether to explain the shades of the weight, beside the map. Defaults to True.
         ax (Axes, optional): where to draw. A figure of one column's width is made by default.
 
     Returns:
@@ -94,12 +96,10 @@ def grid_world(
     ax.hlines(np.arange(height + 1), 0, width, color=_LINES, linewidth=0.4, zorder=1.5)
     ax.vlines(np.arange(width + 1), 0, height, color=_LINES, linewidth=0.4, zorder=1.5)
     _set_frame(ax, walls.shape, title)
-    if weight is not None:
-        bar = figure.colorbar(ScalarMappable(Normalize(0, 1), _WEIGHT_MAP), ax=ax, shrink=0.7, aspect=22, pad=0.02)
-        bar.set_label(r"Prior weight $\omega$")
-        bar.outline.set_linewidth(0.5)
+    if weight is not None and colorbar:
+        add_weight_scale(figure, ax, shrink=0.7, aspect=22, pad=0.02)
     if legend:
-        _add_legend(figure, weight is not None, bool((degraded & free).any()))
+        add_legend(figure, weight is not None, bool((degraded & free).any()))
     # the layout is settled: what is drawn into the cells is as large as they are
     cell = _cell_points(ax, walls.shape)
     if weight is not None:  # the start stays recognisable where its own weight is shown
@@ -203,7 +203,15 @@ def _set_frame(ax: Axes, shape: tuple[int, int], title: str | None) -> None:
         ax.set_title(title)
 
 
-def _add_legend(figure: Figure | SubFigure, weighted: bool, degraded: bool) -> None:
+def add_weight_scale(figure: Figure, where: Any, **options: Any) -> None:
+    """The shades of the weight, as a colour bar beside one or more axes."""
+    bar = figure.colorbar(ScalarMappable(Normalize(0, 1), _WEIGHT_MAP), ax=where, **options)
+    bar.set_label(r"Prior weight $\omega$")
+    bar.outline.set_linewidth(0.5)
+
+
+def add_legend(figure: Figure | SubFigure, weighted: bool, degraded: bool) -> None:
+    """What the colours of the cells mean, below the figure."""
     outline: dict[str, Any] = {"linewidth": 0.6, "edgecolor": "0.4"}
     start = Patch(fill=False, edgecolor=_START, linewidth=1.2) if weighted else Patch(facecolor=_START, **outline)
     handles = [(start, "Start"), (Patch(facecolor=_WALL, **outline), "Wall")]

@@ -76,8 +76,11 @@ _METHODS = {
     "ae2r": ("AE2R", "#0072B2"),
     "kickstart": ("Kickstart", "#CC79A7"),
     "aligned": ("Aligned", "#009E73"),
+    # of Tol's muted palette, for there are no more in that one
+    "annealed_kickstart": ("Annealed kickstart", "#882255"),
+    "kl_penalty": ("KL penalty", "#999933"),
 }
-_OTHER_COLORS = ("#882255", "#44AA99", "#999933", "#332288", "#AA4499", "#661100")
+_OTHER_COLORS = ("#44AA99", "#332288", "#AA4499", "#661100")
 
 
 def method_label(name: str) -> str:

@@ -3,6 +3,7 @@
 from torchrl_priors.tabular.actor_critic import LOG_FIELDS, Hyper
 from torchrl_priors.tabular.advice import advice_tables, parse_prior, sample_degraded
 from torchrl_priors.tabular.q_learning import TeacherHyper, evaluate_greedy
+from torchrl_priors.tabular.snapshots import WeightHistory, weight_history
 from torchrl_priors.tabular.study import StudentConfig, runs_of, train_students, train_teachers
 
 __all__ = [
@@ -10,6 +11,7 @@ __all__ = [
     "Hyper",
     "StudentConfig",
     "TeacherHyper",
+    "WeightHistory",
     "advice_tables",
     "evaluate_greedy",
     "parse_prior",
@@ -17,4 +19,5 @@ __all__ = [
     "sample_degraded",
     "train_students",
     "train_teachers",
+    "weight_history",
 ]

@@ -19,6 +19,7 @@ from torch.func import grad
 from torchrl_priors import functional as F
 from torchrl_priors.envs.gridworld import GridMaps, transition
 from torchrl_priors.random import uniform
+from torchrl_priors.schedules import Schedule
 
 __all__ = [
     "ADVICE_WIDTH",
@@ -56,6 +57,7 @@ class Hyper:
         end_prob: probability that a step ends the episode.
         eval_interval: training transitions between two evaluation points.
         eval_points: evaluation episodes of a run; the last one ends it.
+        schedule: factor on the coefficients of annealed runs, by training transitions; None where there are none.
     """
 
     gamma: float
@@ -64,6 +66,7 @@ class Hyper:
     end_prob: float
     eval_interval: int
     eval_points: int
+    schedule: Schedule | None = None
 
 
 class Runs(NamedTuple):
@@ -76,7 +79,10 @@ class Runs(NamedTuple):
         adversary: int64, where the adversary of its world begins.
         degrade_prob: probability of a random degradation at each visited step.
         bonus_current, bonus_next: coefficient of each kind of bonus.
+        relative: bool, whether the bonus is relative to the student's log-probability.
         aux_coeff: coefficient of the auxiliary loss.
+        teacher_mean: bool, whether that averages over the teacher's actions (else over the student's).
+        annealed: bool, whether the schedule applies to these coefficients.
         adaptive: bool, whether the prior weight is learned (else 1).
         advantage_target: bool, whether it regresses on the advantage (else on the TD error).
         shaped: bool, whether that TD error is of the critic that sees the bonus.
@@ -90,7 +96,10 @@ class Runs(NamedTuple):
     degrade_prob: Tensor
     bonus_current: Tensor
     bonus_next: Tensor
+    relative: Tensor
     aux_coeff: Tensor
+    teacher_mean: Tensor
+    annealed: Tensor
     adaptive: Tensor
     advantage_target: Tensor
     shaped: Tensor
@@ -200,10 +209,12 @@ def _visit_loss(
     """Sum over rows of the actor's and the prior weight's losses of one visit, all of which touch one record."""
     log_probs = logits.log_softmax(0)
     prior_log_prob = pick(advice, action)
-    cross_entropy = F.categorical_cross_entropy(log_probs.movedim(0, -1), advice.movedim(0, -1))
+    student, prior = log_probs.movedim(0, -1), advice.movedim(0, -1)
+    cross_entropy = F.categorical_cross_entropy(student, prior)
     weight = torch.where(runs.adaptive, weight_logit.sigmoid(), 1.0)
     actor = F.policy_gradient_loss(pick(log_probs, action), advantage)
-    auxiliary = runs.aux_coeff * weight.detach() * cross_entropy
+    pulled = torch.where(runs.teacher_mean, F.categorical_cross_entropy(prior, student), cross_entropy)
+    auxiliary = runs.aux_coeff * weight.detach() * pulled
     by_td = F.prior_weight_loss(target_before, weight, runs.bonus_next * followed_log_prob)
     by_td = by_td + F.prior_weight_loss(target_now, weight, runs.bonus_current * prior_log_prob)
     aligned = F.alignment(prior_log_prob, cross_entropy.detach())
@@ -244,6 +255,10 @@ def advance(
     states = (records.shape[0] // RECORD_WIDTH - 1) // rows
     row = torch.arange(rows, device=clock.device)
     draw, slip, end, degrade = uniform(runs.key, clock)
+    if hyper.schedule is not None:
+        factor = torch.where(runs.annealed, hyper.schedule(carry.steps), 1.0)
+        scaled = (value * factor for value in (runs.bonus_current, runs.bonus_next, runs.aux_coeff))
+        runs = runs._replace(**dict(zip(("bonus_current", "bonus_next", "aux_coeff"), scaled, strict=True)))
     active = carry.points < hyper.eval_points
     training, tested = active & ~carry.evaluating, active & carry.evaluating
 
@@ -254,7 +269,8 @@ def advance(
         maps, carry.position, carry.action, slip, end, noise=hyper.noise, end_prob=hyper.end_prob
     )
     prior_log_prob = pick(carry.advice, carry.action)
-    current_bonus = runs.bonus_current * F.prior_bonus(weight, prior_log_prob)
+    own_log_prob = torch.where(runs.relative, pick(here.logits.log_softmax(0), carry.action), 0.0)
+    current_bonus = runs.bonus_current * F.prior_bonus(weight, prior_log_prob - own_log_prob)
 
     def learn(
         value: Tensor, raw_value: Tensor, next_bonus: Tensor, terminated: Tensor, stays: Tensor

@@ -47,6 +47,7 @@ class StudentConfig:
         bonus_coeff: coefficient of the bonus.
         aux_coeff: coefficient of the auxiliary loss.
         temperature: of the Boltzmann teacher.
+        anneal_all: whether the schedule applies to every method (else to those that are annealed by definition).
     """
 
     hyper: Hyper
@@ -55,6 +56,7 @@ class StudentConfig:
     bonus_coeff: float
     aux_coeff: float
     temperature: float
+    anneal_all: bool = False
 
 
 def _pad(values: Tensor, rows: int) -> Tensor:
@@ -147,7 +149,10 @@ def build_runs(
             "degrade_prob": float(degradation.random),
             "bonus_current": float(config.bonus_coeff * (spec.bonus == "current")),
             "bonus_next": float(config.bonus_coeff * (spec.bonus == "next")),
+            "relative": torch.full((count,), spec.relative, device=device),
             "aux_coeff": float(config.aux_coeff * spec.auxiliary),
+            "teacher_mean": torch.full((count,), spec.cross_entropy == "teacher", device=device),
+            "annealed": torch.full((count,), spec.annealed or config.anneal_all, device=device),
             "adaptive": torch.full((count,), spec.adaptive, device=device),
             "advantage_target": torch.full((count,), spec.weight_target == "advantage", device=device),
             "shaped": torch.full((count,), config.td_error == "shaped", device=device),

@@ -36,6 +36,9 @@ class PriorBonus(BatchTransform):
     Keyword Args:
         shift ("next", "current" or "none"): the step whose advice is rewarded; ``"none"`` is no bonus, for the methods
             that have an auxiliary loss only. Defaults to ``"next"``.
+        relative (bool): subtracts the student's log-probability, :math:`B_t = \omega(s)(\log\pi_0(a|s)-\log\pi(a|s))`:
+            the penalty of KL-regularised RL, in the mean :math:`-\mathrm{KL}(\pi\|\pi_0)`. Of ``shift="current"`` only,
+            and not centred. Defaults to ``False``.
         bonus_coeff (float): :math:`c`, kept as a buffer. Defaults to 1.
         centering ("none", "prior" or "policy"): adds the center that :class:`PriorLogProb` wrote with the same setting,
             :math:`B_t = \omega(s)(\log\pi_0(a|s) + c(s))`. Defaults to ``"none"``.
@@ -43,6 +46,8 @@ class PriorBonus(BatchTransform):
         terminated_key (NestedKey): bool, ``[*B, T, 1]``, read under ``"next"``. Defaults to ``"terminated"``.
         log_prob_key, center_key (NestedKey): what :class:`PriorLogProb` wrote, ``[*B, T, 1]``. Defaults to
             ``"prior_log_prob"`` and ``"prior_center"``.
+        student_log_prob_key (NestedKey): :math:`\log\pi(a|s)` of the policy that collected the batch, ``[*B, T]`` or
+            ``[*B, T, 1]``, read if ``relative``. Defaults to ``"action_log_prob"``.
         out_keys (list of NestedKey, optional): the bonus (without :math:`c`) and the shaped reward, ``[*B, T, 1]``.
             Defaults to ``[("next", "prior_bonus"), ("next", "shaped_reward")]``.
 
@@ -74,17 +79,23 @@ class PriorBonus(BatchTransform):
         prior_weight: PriorWeight | None = None,
         *,
         shift: _Shift = "next",
+        relative: bool = False,
         bonus_coeff: float = 1.0,
         centering: _Centering = "none",
         reward_key: NestedKey = "reward",
         terminated_key: NestedKey = "terminated",
         log_prob_key: NestedKey = "prior_log_prob",
         center_key: NestedKey = "prior_center",
+        student_log_prob_key: NestedKey = "action_log_prob",
         out_keys: list[NestedKey] | None = None,
     ) -> None:
         for name, value, known in (("shift", shift, _Shift), ("centering", centering, _Centering)):
             if value not in get_args(known):
                 raise ValueError(f"Unknown {name} {value!r}: expected one of {', '.join(get_args(known))}.")
+        if relative and (shift != "current" or centering != "none"):
+            raise ValueError(
+                f"relative=True needs shift='current' and centering='none', got {shift!r} and {centering!r}."
+            )
         out_keys = [("next", "prior_bonus"), ("next", "shaped_reward")] if out_keys is None else out_keys
         if len(out_keys) != 2:
             raise ValueError(f"Expected a key for the bonus and one for the shaped reward, got {out_keys}.")
@@ -95,9 +106,11 @@ class PriorBonus(BatchTransform):
             raise ValueError(f"The reward {self.reward_key!r} must not be overwritten: use another of out_keys.")
         self.__dict__["prior_weight"] = prior_weight
         self.shift = shift
+        self.relative = relative
         self.centering = centering
         at = under_next if shift == "next" else unravel_key
         self.log_prob_key, self.center_key = at(log_prob_key), at(center_key)
+        self.student_log_prob_key = unravel_key(student_log_prob_key)
         self.register_buffer("bonus_coeff", torch.tensor(float(bonus_coeff)))
 
     @classmethod
@@ -119,7 +132,7 @@ class PriorBonus(BatchTransform):
         spec = get_method(method)
         if spec.adaptive and prior_weight is None:
             raise ValueError(f"The method {method!r} has a learned weight: pass prior_weight.")
-        return cls(prior_weight if spec.adaptive else None, shift=spec.bonus, **kwargs)
+        return cls(prior_weight if spec.adaptive else None, shift=spec.bonus, relative=spec.relative, **kwargs)
 
     @classmethod
     def from_loss(cls, loss: LossModule, **kwargs: Any) -> PriorBonus:
@@ -175,6 +188,9 @@ class PriorBonus(BatchTransform):
             center = self._get(
                 tensordict, self.center_key, f"Run PriorLogProb with centering={self.centering!r} first."
             )
+        if self.relative:
+            student = self._get(tensordict, self.student_log_prob_key, "The policy must return its log-probabilities.")
+            log_prob = log_prob - student.reshape(log_prob.shape)
         weight: Tensor | float = 1.0
         module: PriorWeight | None = self.__dict__["prior_weight"]
         if module is not None:

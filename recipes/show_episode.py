@@ -1,0 +1,138 @@
+"""An episode of a finished MuJoCo run, with what its prior weight makes of the teacher's advice."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
+
+from recipes.mujoco import Agent
+from torchrl_priors import PriorLogProb, StructuralDegradation, plots
+from torchrl_priors.collectors import VectorCollector, make_vector_env
+from torchrl_priors.collectors.vector_env import spread_seed
+from torchrl_priors.functional import td_residual
+from torchrl_priors.methods import get_method
+from torchrl_priors.plots.video import write_weight_video
+
+__all__ = ["show_episode"]
+
+
+def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
+    """The agent of a run as its last checkpoint has it, and the name of its environment.
+
+    A checkpoint holds every network and the normaliser as plain tensors: nothing else needs to be exported.
+
+    Raises:
+        ValueError: the run has no learned weight or no checkpoint, or the teacher is not that of the run.
+    """
+    cfg: Any = OmegaConf.load(folder / "config.yaml")
+    if not get_method(cfg.method).adaptive:
+        raise ValueError(f"{folder} is a run of method={cfg.method}, which has no learned weight.")
+    if teacher is not None:
+        cfg.prior.path = teacher
+    expected = json.loads((folder / "config.json").read_text())["prior"]["sha256"]
+    path = Path(cfg.prior.path)
+    if not path.is_file():
+        raise ValueError(f"The run's teacher {path} is not there: say where it is by episode.teacher=<file>.")
+    if sha256(path.read_bytes()).hexdigest() != expected:
+        raise ValueError(f"{path} is not the teacher of {folder}: its content is another one.")
+    env_id = f"{cfg.env.id}-{cfg.env.version}"
+    env = make_vector_env(env_id, 1, **cfg.env.kwargs)
+    agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
+    env.close()
+    rotation = CheckpointRotation(folder / "checkpoints", keep_last=cfg.checkpoint.keep)
+    if rotation.latest() is None:
+        raise ValueError(f"{folder} has no checkpoint.")
+    rotation.load_latest(Checkpoint(agent=agent), components=["agent"])
+    agent.normalizer.freeze()
+    return agent, env_id
+
+
+def play(agent: Agent, env_id: str, seed: int, steps: int) -> TensorDictBase:
+    """The first steps of an episode of the stochastic policy, ``[T]``, scored under the teacher."""
+    env = make_vector_env(env_id, 1, **agent.cfg.env.kwargs)
+    collector = VectorCollector(
+        env, agent.actor, frames_per_batch=steps, total_frames=-1, normalizer=agent.normalizer, seed=seed
+    )
+    torch.manual_seed(seed)  # what a degradation draws
+    rollout = collector.rollout()
+    collector.shutdown()
+    (score,) = (transform for transform in agent.transforms if isinstance(transform, PriorLogProb))
+    rollout = score(rollout)[0]
+    ended = rollout["next", "done"].squeeze(-1).nonzero()
+    return rollout[: int(ended[0]) + 1] if len(ended) else rollout
+
+
+@torch.no_grad()
+def weigh(agent: Agent, episode: TensorDictBase) -> dict[str, Tensor | None]:
+    """The weight, log pi0, the TD error on raw rewards and where the advice is degraded, ``[T]`` each."""
+    assert agent.weight is not None
+    critic = agent.critic if agent.raw_critic is None else agent.raw_critic
+    value, next_value = (critic(part.copy())["state_value"] for part in (episode, episode["next"]))
+    delta = td_residual(
+        value, episode["next", "reward"], next_value, episode["next", "terminated"], agent.cfg.ppo.gamma
+    )
+    degraded, prior = None, agent.loss.prior_loss.prior  # type: ignore[union-attr]
+    if isinstance(prior, StructuralDegradation):
+        degraded = prior.mask(episode).reshape(-1)
+    elif agent.cfg.prior.degrade == "random":
+        degraded = episode[prior.draw_key].reshape(-1)  # type: ignore[index]
+    weight = agent.weight(episode.copy())["prior_weight"]
+    rows = {"weight": weight, "log_prob": episode["prior_log_prob"], "td_error": delta}
+    return {name: row.reshape(-1) for name, row in rows.items()} | {"degraded": degraded}
+
+
+def render(env_id: str, kwargs: Any, actions: np.ndarray, seed: int) -> tuple[list[np.ndarray], float]:
+    """Pictures of the episode, played once more, and how many there are a second.
+
+    Raises:
+        ValueError: there is no OpenGL to draw with.
+    """
+    import gymnasium
+
+    try:
+        env = gymnasium.make(env_id, render_mode="rgb_array", width=320, height=320, **kwargs)
+        env.reset(seed=spread_seed(seed, 1, stream=0)[0][0])
+        frames = []
+        for action in actions:
+            frames.append(np.asarray(env.render()))
+            env.step(np.clip(action, env.action_space.low, env.action_space.high))  # type: ignore[attr-defined]
+    except Exception as error:  # OpenGL's many ways to fail
+        raise ValueError(
+            f"MuJoCo cannot draw here ({type(error).__name__}: {error}): set MUJOCO_GL=egl or MUJOCO_GL=osmesa, and"
+            " install that library, or leave episode.video=false."
+        ) from error
+    rate = float(env.metadata.get("render_fps", 50))
+    env.close()
+    return frames, rate
+
+
+def show_episode(
+    folder: Path, out: Path, *, seed: int, steps: int, teacher: str | None = None, video: bool = False
+) -> list[Path]:
+    """Figure, and video if asked for, of an episode of a run; their files.
+
+    Raises:
+        ValueError: see :func:`load_agent` and :func:`render`; fewer than one step.
+    """
+    if steps < 1:
+        raise ValueError(f"episode.steps={steps}: expected a positive number.")
+    agent, env_id = load_agent(folder, teacher)
+    episode = play(agent, env_id, seed, steps)
+    seen = weigh(agent, episode)
+    figure = plots.episode_weights(**seen, method=agent.cfg.method)
+    written = plots.save_figure(figure, out / f"weight_episode_{seed}")
+    if video:
+        frames, rate = render(env_id, agent.cfg.env.kwargs, episode["action"].numpy(), seed)
+        written.append(
+            write_weight_video(out / f"weight_episode_{seed}.gif", frames, seen["weight"], seen["degraded"], rate=rate)
+        )
+    return written
