@@ -12,21 +12,41 @@ from torchrl_priors.metrics import (
     probability_of_improvement,
     stratified_bootstrap_ci,
 )
-from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, ValueOffset, cross_entropy
+from torchrl_priors.objectives import (
+    AE2RLoss,
+    AVECMixin,
+    ClipPPOPriorLoss,
+    MultiTeacherLoss,
+    ValueOffset,
+    cross_entropy,
+)
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
-from torchrl_priors.transforms import PriorBonus, PriorLogProb
+from torchrl_priors.priors import (
+    ActionPrior,
+    AffordancePrior,
+    BoltzmannPrior,
+    CallablePrior,
+    MixturePrior,
+    ModulePrior,
+    UniformPrior,
+)
+from torchrl_priors.transforms import PriorBonus, PriorLogProb, multi_teacher_transforms
 
 __all__ = [
     "METHODS",
     "AE2RLoss",
     "AVECMixin",
     "ActionPrior",
+    "AffordancePrior",
     "BoltzmannPrior",
+    "CallablePrior",
     "ClipPPOPriorLoss",
     "GridWorldEnv",
     "GridWorlds",
     "MethodSpec",
+    "MixturePrior",
+    "ModulePrior",
+    "MultiTeacherLoss",
     "PriorBonus",
     "PriorLogProb",
     "PriorWeight",
@@ -40,6 +60,7 @@ __all__ = [
     "get_method",
     "iqm",
     "mean_confidence_interval",
+    "multi_teacher_transforms",
     "performance_profile",
     "probability_of_improvement",
     "sample_worlds",
