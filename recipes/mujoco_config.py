@@ -13,7 +13,7 @@ from omegaconf import MISSING
 from recipes.checks import refuse_unknown_keys, require_compiler
 from recipes.loggers import LOGGERS, require_logger
 from recipes.schedule_config import ScheduleConfig, check_schedule
-from torchrl_priors.artifacts import ArtifactError, load_prior, read_manifest
+from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
 from torchrl_priors.methods import get_method
@@ -201,18 +201,23 @@ def check(cfg: MujocoConfig) -> None:
     _require(frames % batch == 0, "total_frames", frames, expected)
     require_logger(cfg.logger)
     require_compiler(cfg.compile)
-    _check_env(cfg)
+    obs_dim, act_dim = _check_env(cfg)
     if cfg.method != "none":
-        _check_prior(cfg)
+        _check_prior(cfg, obs_dim, act_dim)
 
 
-def _check_env(cfg: MujocoConfig) -> None:
-    """Build one environment, so that a wrong name or argument is refused before there is a folder of the run."""
+def _check_env(cfg: MujocoConfig) -> tuple[int, int]:
+    """Build one environment, so that a wrong name or argument is refused before there is a folder of the run.
+
+    Returns:
+        tuple of int: features of its observations, and dimensions of its actions.
+    """
     name = f"{cfg.env.id}-{cfg.env.version}"
     try:
         env = make_vector_env(name, 1, **cfg.env.kwargs)
         check_vector_env(env)
         env.close()
+        return env.single_observation_space.shape[0], env.single_action_space.shape[0]
     except ImportError:
         raise
     except Exception as error:  # Gymnasium's own, or whatever its environments raise
@@ -220,7 +225,7 @@ def _check_env(cfg: MujocoConfig) -> None:
         raise ValueError(f"env={name}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
 
-def _check_prior(cfg: MujocoConfig) -> None:
+def _check_prior(cfg: MujocoConfig, obs_dim: int, act_dim: int) -> None:
     """Read the teacher, so that a wrong one is refused before there is a folder of the run."""
     path = Path(str(cfg.prior.path))
     if not path.is_file():
@@ -228,9 +233,10 @@ def _check_prior(cfg: MujocoConfig) -> None:
             f"prior.path={path}: {'a folder, expected a file' if path.is_dir() else 'no such file'}."
         )
     try:
-        load_prior(path, env_id=f"{cfg.env.id}-{cfg.env.version}")
+        env_id = f"{cfg.env.id}-{cfg.env.version}"
+        load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
     except ArtifactError as error:
         raise ValueError(f"prior.path: {error}") from None
     if cfg.prior.degrade == "structural":
-        last = read_manifest(path).obs_dim - 1
+        last = obs_dim - 1
         _require(0 <= cfg.prior.feature <= last, "prior.feature", cfg.prior.feature, f"a number from 0 to {last}")

@@ -13,19 +13,36 @@ from torchrl_priors.metrics import (
     probability_of_improvement,
     stratified_bootstrap_ci,
 )
-from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, ValueOffset, cross_entropy
+from torchrl_priors.objectives import (
+    AE2RLoss,
+    AVECMixin,
+    ClipPPOPriorLoss,
+    MultiTeacherLoss,
+    ValueOffset,
+    cross_entropy,
+)
 from torchrl_priors.prior_trust import PriorTrust, advice_evidence
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.priors import (
+    ActionPrior,
+    AffordancePrior,
+    BoltzmannPrior,
+    CallablePrior,
+    MixturePrior,
+    ModulePrior,
+    UniformPrior,
+)
 from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
-from torchrl_priors.transforms import PriorBonus, PriorLogProb
+from torchrl_priors.transforms import PriorBonus, PriorLogProb, multi_teacher_transforms
 
 __all__ = [
     "METHODS",
     "AE2RLoss",
     "AVECMixin",
     "ActionPrior",
+    "AffordancePrior",
     "BoltzmannPrior",
+    "CallablePrior",
     "ClipPPOPriorLoss",
     "CoeffScheduler",
     "CosineSchedule",
@@ -33,6 +50,9 @@ __all__ = [
     "GridWorlds",
     "LinearSchedule",
     "MethodSpec",
+    "MixturePrior",
+    "ModulePrior",
+    "MultiTeacherLoss",
     "PiecewiseSchedule",
     "PriorBonus",
     "PriorLogProb",
@@ -50,6 +70,7 @@ __all__ = [
     "get_method",
     "iqm",
     "mean_confidence_interval",
+    "multi_teacher_transforms",
     "performance_profile",
     "probability_of_improvement",
     "register_configs",

@@ -1,6 +1,18 @@
 """Teachers as files: a policy with the frozen statistics of its observations, without pickle."""
 
-from torchrl_priors.artifacts.format import ArtifactError, PolicyManifest, read_manifest
+from torchrl_priors.artifacts.format import ArtifactError, PolicyManifest, PriorManifest, read_manifest
 from torchrl_priors.artifacts.policy import load_policy, load_prior, save_policy
+from torchrl_priors.artifacts.prior import save_prior
+from torchrl_priors.artifacts.sb3 import load_sb3_prior
 
-__all__ = ["ArtifactError", "PolicyManifest", "load_policy", "load_prior", "read_manifest", "save_policy"]
+__all__ = [
+    "ArtifactError",
+    "PolicyManifest",
+    "PriorManifest",
+    "load_policy",
+    "load_prior",
+    "load_sb3_prior",
+    "read_manifest",
+    "save_policy",
+    "save_prior",
+]

@@ -20,18 +20,23 @@ from torch import Tensor
 from torchrl_priors.networks import ACTIVATIONS
 
 __all__ = [
+    "POLICY",
+    "PRIOR",
     "STATISTICS",
     "ArtifactError",
     "PolicyManifest",
+    "PriorManifest",
     "check_tensors",
     "pack",
     "parse_manifest",
+    "parse_prior_manifest",
     "read",
+    "read_file",
     "read_manifest",
     "write_atomically",
 ]
 
-_FORMAT = "torchrl_priors.policy"
+POLICY, PRIOR = "torchrl_priors.policy", "torchrl_priors.prior"
 _VERSION = 1
 _ARCHITECTURE = "gaussian_mlp"
 _MAX_HEADER = 1 << 20  # bytes: a policy's header has a few thousand, another model's may have many
@@ -76,8 +81,25 @@ class PolicyManifest:
     training: dict[str, Any] = field(default_factory=dict)
 
 
-def read_manifest(path: str | os.PathLike[str]) -> PolicyManifest:
-    """Reads what a policy file says of its policy, and checks the file as :func:`load_policy` does.
+@dataclass(frozen=True)
+class PriorManifest:
+    """What the file of a prior (:func:`~torchrl_priors.artifacts.save_prior`) says of it.
+
+    Args:
+        env_id (str): the environment that it advises on, e.g. ``"HalfCheetah-v5"``.
+        prior (dict): its parts: kinds of priors, layers of networks, and their sizes.
+        evaluation (dict): how good it is, e.g. ``{"mean_return": 1828.0, "episodes": 50}``.
+        training (dict): where it is from.
+    """
+
+    env_id: str
+    prior: dict[str, Any]
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)
+
+
+def read_manifest(path: str | os.PathLike[str]) -> PolicyManifest | PriorManifest:
+    """Reads what the file of a policy or a prior says of it, and checks the file as :func:`load_policy` does.
 
     Args:
         path (str or path): the file.
@@ -87,7 +109,7 @@ def read_manifest(path: str | os.PathLike[str]) -> PolicyManifest:
         ArtifactError: as :func:`load_policy`.
         ImportError: safetensors is not installed.
     """
-    return read(Path(path))[1]
+    return read_file(Path(path))[1]
 
 
 def _safetensors() -> ModuleType:
@@ -98,7 +120,7 @@ def _safetensors() -> ModuleType:
     return safetensors
 
 
-def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _VERSION) -> bytes:
+def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _VERSION, *, kind: str = POLICY) -> bytes:
     """The bytes of a file.
 
     Raises:
@@ -106,7 +128,7 @@ def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _V
     """
     # the digest comes first, so that no zeros of the manifest are taken for its place
     about = json.dumps({"sha256": _NO_DIGEST, "version": version, "manifest": manifest}, allow_nan=False)
-    data = _seal(_safetensors().torch.save(tensors, metadata={_FORMAT: about}))
+    data = _seal(_safetensors().torch.save(tensors, metadata={kind: about}))
     if int.from_bytes(data[:8], "little") > _MAX_HEADER:
         raise ValueError(f"This policy can't be saved: its manifest is longer than {_MAX_HEADER} bytes.")
     return data
@@ -137,12 +159,20 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], PolicyManifest]:
-    """The tensors and the manifest of a file, after every check."""
+    """The tensors and the manifest of a policy's file, after every check."""
+    tensors, manifest = read_file(path)
+    if not isinstance(manifest, PolicyManifest):
+        raise ArtifactError(f"{path} can't be used as a policy: it is a prior of save_prior, which load_prior reads.")
+    return tensors, manifest
+
+
+def read_file(path: Path) -> tuple[dict[str, Tensor], PolicyManifest | PriorManifest]:
+    """The tensors and the manifest of a file, after every check but of a prior's tensors, which building it does."""
     _safetensors()
     if not path.is_file():
         raise FileNotFoundError(f"No policy file at {path}.")
     try:
-        data, about = _read_bytes(path)
+        data, kind, about = _read_bytes(path)
         version = about.get("version")
         if type(version) is not int or version != _VERSION:
             raise ArtifactError(
@@ -154,8 +184,10 @@ def read(path: Path) -> tuple[dict[str, Tensor], PolicyManifest]:
             raise ArtifactError("it is damaged: it has no digest")
         if _seal(data.replace(digest.encode(), _NO_DIGEST.encode(), 1)) != data:
             raise ArtifactError("it is damaged: its content does not match its digest")
+        if kind == PRIOR:
+            return _load(data), parse_prior_manifest(about.get("manifest"))
         manifest = parse_manifest(about.get("manifest"))
-        tensors = {name: value.clone() for name, value in _load(data).items()}
+        tensors = _load(data)
         check_tensors(tensors, manifest)
     except ArtifactError as error:
         raise ArtifactError(f"{path} can't be used as a policy: {error}.") from error
@@ -165,13 +197,13 @@ def read(path: Path) -> tuple[dict[str, Tensor], PolicyManifest]:
 def _load(data: bytes) -> dict[str, Tensor]:
     safetensors = _safetensors()
     try:
-        return safetensors.torch.load(data)
+        return {name: value.clone() for name, value in safetensors.torch.load(data).items()}
     except (safetensors.SafetensorError, KeyError, RuntimeError, ValueError) as error:  # e.g. a type torch lacks
         raise ArtifactError(f"its tensors can't be read: {error!r}") from error
 
 
-def _read_bytes(path: Path) -> tuple[bytes, dict[str, Any]]:
-    """A file of this format and its metadata; another's tensors, which may be gigabytes, are not read."""
+def _read_bytes(path: Path) -> tuple[bytes, str, dict[str, Any]]:
+    """A file of this format, its kind and its metadata; another's tensors, which may be gigabytes, are not read."""
     with path.open("rb") as file:
         size = int.from_bytes(file.read(8), "little")
         if size > _MAX_HEADER:
@@ -184,15 +216,16 @@ def _read_bytes(path: Path) -> tuple[bytes, dict[str, Any]]:
         except (ValueError, TypeError, KeyError, RecursionError):  # JSON and UTF-8 errors are ValueErrors
             raise ArtifactError("it is truncated, or not a safetensors file with metadata") from None
         try:
-            about = json.loads(metadata[_FORMAT], parse_constant=_refuse_constant)
-        except (TypeError, KeyError):
+            kind = next(kind for kind in (POLICY, PRIOR) if kind in metadata)
+            about = json.loads(metadata[kind], parse_constant=_refuse_constant)
+        except (TypeError, StopIteration):
             raise ArtifactError("it is a safetensors file, but not one of torchrl_priors.save_policy") from None
         except (ValueError, RecursionError):
             raise ArtifactError("it is damaged: its manifest is not JSON") from None
         if not isinstance(about, dict):
             raise ArtifactError("it is damaged: its manifest is not an object")
         file.seek(0)
-        return file.read(), about
+        return file.read(), kind, about
 
 
 def _refuse_constant(name: str) -> None:
@@ -230,6 +263,19 @@ def parse_manifest(values: Any) -> PolicyManifest:
         if not isinstance(values[name], dict):
             raise ArtifactError(f"its {name} must be an object of JSON, got {values[name]!r}")
     return PolicyManifest(**{**values, "hidden": tuple(hidden)})
+
+
+def parse_prior_manifest(values: Any) -> PriorManifest:
+    """The manifest of a prior from JSON; its parts are checked when they are built."""
+    names = {item.name for item in fields(PriorManifest)}
+    if not isinstance(values, dict) or values.keys() != names:
+        raise ArtifactError(f"its manifest must have the entries {', '.join(sorted(names))}")
+    if not isinstance(values["env_id"], str) or not values["env_id"]:
+        raise ArtifactError(f"it must name its environment, got env_id={values['env_id']!r}")
+    for name in ("prior", "evaluation", "training"):
+        if not isinstance(values[name], dict):
+            raise ArtifactError(f"its {name} must be an object of JSON, got {values[name]!r}")
+    return PriorManifest(**values)
 
 
 def _is_count(value: Any, least: int) -> bool:

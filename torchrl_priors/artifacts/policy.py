@@ -20,12 +20,16 @@ from torchrl_priors.artifacts.format import (
     STATISTICS,
     ArtifactError,
     PolicyManifest,
+    PriorManifest,
     check_tensors,
     pack,
     parse_manifest,
     read,
+    read_file,
     write_atomically,
 )
+from torchrl_priors.artifacts.prior import build_prior
+from torchrl_priors.artifacts.spaces import check_spaces
 from torchrl_priors.collectors.running_norm import RunningNorm
 from torchrl_priors.networks import GaussianMLP, gaussian_actor
 from torchrl_priors.priors import ActionPrior
@@ -136,6 +140,12 @@ def load_policy(
         ImportError: safetensors is not installed.
     """
     tensors, manifest = read(Path(path))
+    return *_build_policy(tensors, manifest, in_key, device), manifest
+
+
+def _build_policy(
+    tensors: dict[str, Tensor], manifest: PolicyManifest, in_key: NestedKey, device: torch.device | str | None
+) -> tuple[ProbabilisticActor, RunningNorm | None]:
     # parameters are taken from the file: drawing them first would move the random numbers of the caller's run
     net = GaussianMLP(manifest.obs_dim, manifest.act_dim, manifest.hidden, manifest.activation, device="meta")
     net.load_state_dict(_strip(tensors, "actor."), assign=True)
@@ -145,7 +155,7 @@ def load_policy(
         for name, value in _strip(tensors, "normalizer.").items():
             getattr(normalizer, name).copy_(value)
         normalizer = normalizer.freeze().to(device)
-    return gaussian_actor(net.to(device), in_key), normalizer, manifest
+    return gaussian_actor(net.to(device), in_key), normalizer
 
 
 def load_prior(
@@ -154,11 +164,11 @@ def load_prior(
     env_id: str | None = None,
     observation_spec: TensorSpec | Sequence[int] | int | None = None,
     action_spec: TensorSpec | Sequence[int] | int | None = None,
-    in_key: NestedKey = "observation",
+    in_key: NestedKey | None = None,
     namespace: NestedKey = "prior",
     device: torch.device | str | None = None,
 ) -> ActionPrior:
-    """Reads a policy that :func:`save_policy` wrote as a teacher: raw observations in, its advice out.
+    """Reads what :func:`save_policy` or :func:`save_prior` wrote as a teacher: raw observations in, its advice out.
 
     It normalises observations by the frozen statistics of its own training, whatever the student does to its own.
 
@@ -171,8 +181,10 @@ def load_prior(
         observation_spec (TensorSpec, sequence of int or int, optional): the student's raw observations, or the shape of
             one. Defaults to ``None``: not checked.
         action_spec (TensorSpec, sequence of int or int, optional): the student's actions, or the shape of one. Defaults
-            to ``None``: not checked here, but whenever an action is scored.
-        in_key (NestedKey): *raw* observations ``[*B, obs_dim]``. Defaults to ``"observation"``.
+            to ``None``: not checked here, but whenever an action is scored. Those of a :func:`save_prior` file are
+            checked here if ``observation_spec`` is given too.
+        in_key (NestedKey, optional): *raw* observations ``[*B, obs_dim]``. Defaults to ``None``: ``"observation"``, or
+            what the prior of a :func:`save_prior` file read.
         namespace (NestedKey): the parameters are written under ``(namespace, name)``. Defaults to ``"prior"``.
         device (torch.device, optional): defaults to the CPU.
 
@@ -182,13 +194,22 @@ def load_prior(
         TypeError: a spec is one of several entries.
         ImportError: safetensors is not installed.
     """
-    inner_key = ("_teacher", "observation")  # exists within the prior only
-    actor, normalizer, manifest = load_policy(path, in_key=inner_key, device=device)
+    tensors, manifest = read_file(Path(path))
     if env_id is not None and env_id != manifest.env_id:
         raise ArtifactError(
             f"{path} is a policy of {manifest.env_id}, and the student's environment is {env_id}. With env_id=None a"
             " teacher of another environment with the same spaces is taken."
         )
+    if isinstance(manifest, PriorManifest):
+        try:
+            prior = build_prior(tensors, manifest.prior, in_key=in_key, namespace=namespace)
+            if observation_spec is not None:
+                check_spaces(prior, observation_spec, action_spec)
+        except ArtifactError as error:
+            raise ArtifactError(f"{path} can't be used as a prior: {error}.") from error
+        return prior.to(device)
+    inner_key = ("_teacher", "observation")  # exists within the prior only
+    actor, normalizer = _build_policy(tensors, manifest, inner_key, device)
     for name, spec, size in (
         ("observations", observation_spec, manifest.obs_dim),
         ("actions", action_spec, manifest.act_dim),
@@ -198,7 +219,11 @@ def load_prior(
                 f"{path} is a policy with {name} of shape ({size},) ({manifest.env_id}), and the student's are of shape"
                 f" {shape}."
             )
-    first = TensorDictModule(_TeacherInput(normalizer, manifest), in_keys=[in_key], out_keys=[inner_key])
+    first = TensorDictModule(
+        _TeacherInput(normalizer, manifest),
+        in_keys=["observation" if in_key is None else in_key],
+        out_keys=[inner_key],
+    )
     return ActionPrior(ProbabilisticTensorDictSequential(first, *actor.module), namespace=namespace)
 
 

@@ -6,6 +6,7 @@ from .ae2r import AE2RLoss
 from .avec import AVECMixin, ValueOffset
 from .compiled_step import CompiledStep
 from .cross_entropy import cross_entropy, has_analytic_cross_entropy, kl_divergence
+from .multi_teacher import MultiTeacherLoss
 from .ppo import ClipPPOPriorLoss
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "AVECMixin",
     "ClipPPOPriorLoss",
     "CompiledStep",
+    "MultiTeacherLoss",
     "ValueOffset",
     "cross_entropy",
     "has_analytic_cross_entropy",

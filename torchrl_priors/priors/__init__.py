@@ -1,7 +1,19 @@
 """Soft action priors: one interface, :class:`ActionPrior`, and ready-made teachers."""
 
 from torchrl_priors.priors.action_prior import ActionPrior
+from torchrl_priors.priors.affordance import AffordancePrior
 from torchrl_priors.priors.boltzmann import BoltzmannPrior
+from torchrl_priors.priors.callable import CallablePrior
+from torchrl_priors.priors.mixture import MixturePrior
+from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.uniform import UniformPrior
 
-__all__ = ["ActionPrior", "BoltzmannPrior", "UniformPrior"]
+__all__ = [
+    "ActionPrior",
+    "AffordancePrior",
+    "BoltzmannPrior",
+    "CallablePrior",
+    "MixturePrior",
+    "ModulePrior",
+    "UniformPrior",
+]

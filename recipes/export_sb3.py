@@ -1,0 +1,55 @@
+"""Make a teacher of a Stable-Baselines3 policy, for ``prior.path`` of ``recipes.mujoco``.
+
+python -m recipes.export_sb3 model=ppo.zip vecnormalize=vec.pkl env_id=Hopper-v5 out=teacher.safetensors
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from recipes.checks import refuse_unknown_keys
+from torchrl_priors.artifacts import load_sb3_prior, save_prior
+
+
+@dataclass
+class ExportConfig:
+    """The whole configuration of ``python -m recipes.export_sb3``."""
+
+    model: str = MISSING
+    env_id: str = MISSING
+    out: str = MISSING
+    vecnormalize: str | None = MISSING
+    std: float | None = MISSING
+    activation: str | None = MISSING
+
+
+ConfigStore.instance().store(group="schema", name="export_sb3", node=ExportConfig, package="_global_")
+
+
+def export(cfg: ExportConfig) -> None:
+    """Convert the policy, and write it."""
+    refuse_unknown_keys(cfg)
+    prior = load_sb3_prior(cfg.model, vecnormalize=cfg.vecnormalize, std=cfg.std, activation=cfg.activation)
+    files = {"model": cfg.model, "vecnormalize": cfg.vecnormalize}
+    training = {name: None if path is None else Path(path).name for name, path in files.items()}
+    save_prior(cfg.out, prior, env_id=cfg.env_id, training={"from": "stable_baselines3", **training})
+    print(f"Written: {cfg.out}")
+
+
+@hydra.main(version_base="1.3", config_path="../conf", config_name="export_sb3")
+def main(cfg: ExportConfig) -> None:
+    """Export one policy."""
+    try:
+        export(cfg)
+    except (ValueError, OSError, ImportError) as error:
+        sys.exit(f"Error: {error}")
+
+
+if __name__ == "__main__":
+    main()

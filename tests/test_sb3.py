@@ -1,0 +1,296 @@
+"""Claims about teachers of Stable-Baselines3."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import pickle
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from hydra import compose, initialize_config_dir
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sb3_cases import BOX, MODELS, PPO, DummyVecEnv, Model, Noise, Saved, VecNormalize, save_model
+from tensordict import TensorDict
+from torch import nn
+
+from recipes.export_sb3 import export
+from torchrl_priors.artifacts import ArtifactError, load_prior, load_sb3_prior, save_prior
+from torchrl_priors.artifacts.sb3_files import read_vecnormalize
+from torchrl_priors.priors import ModulePrior
+
+CONF = Path(__file__).parents[1] / "conf"
+NUMBER = 1000
+TOLERANCE = {"atol": 1e-6, "rtol": 0.0}
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Saved]:
+    folder = tmp_path_factory.mktemp("sb3")
+    models: dict[str, Saved] = {}
+
+    def get(name: str) -> Saved:
+        if name not in models:
+            models[name] = save_model(name, folder)
+        return models[name]
+
+    return get
+
+
+def observations(case: Model, number: int = NUMBER) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    if case.observations.dtype == np.uint8:
+        return rng.integers(0, 256, (number, *case.observations.shape), dtype=np.uint8)
+    return rng.normal(size=(number, 3)) * np.array([0.1, 1.0, 30.0]) + 2
+
+
+def convert(model: Saved, name: str) -> ModulePrior:
+    return load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.1 if name == "td3" else None)
+
+
+def batch_of(raw: np.ndarray) -> TensorDict:
+    return TensorDict(observation=torch.as_tensor(raw), batch_size=[len(raw)])
+
+
+@pytest.fixture(params=MODELS)
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+class TestConversion:
+    def test_same_deterministic_actions(self, saved: Callable[[str], Saved], name: str) -> None:
+        model, raw = saved(name), observations(MODELS[name])
+        seen = model.env.normalize_obs(raw) if model.vecnormalize else raw
+        expected = torch.as_tensor(model.model.predict(seen, deterministic=True)[0])
+        dist = convert(model, name).get_dist(batch_of(raw))
+        if expected.is_floating_point():
+            action = dist.deterministic_sample if name == "sac" else dist.mean
+            low, high = torch.as_tensor(BOX.low), torch.as_tensor(BOX.high)
+            torch.testing.assert_close(torch.minimum(torch.maximum(action, low), high), expected, **TOLERANCE)
+            assert expected.std(0).min() > 0.01  # not all at a bound
+        else:
+            assert torch.equal(dist.probs.argmax(-1), expected)
+            assert len(expected.unique()) > 1
+
+    def test_same_log_probabilities(self, saved: Callable[[str], Saved], name: str) -> None:
+        model, raw = saved(name), observations(MODELS[name])
+        seen = model.env.normalize_obs(raw) if model.vecnormalize else raw
+        policy = model.model.policy
+        tensor = policy.obs_to_tensor(seen)[0]
+        prior, batch = convert(model, name), batch_of(raw)
+        with torch.no_grad():
+            if name == "td3":
+                pytest.skip("TD3 has no distribution of its own")
+            if name == "sac":
+                # in float64, as the inverse of tanh amplifies rounding
+                mean, log_std, _ = policy.actor.get_action_dist_params(tensor)
+                assert log_std.max() == 2  # it is clamped
+                dist = policy.actor.action_dist.proba_distribution(mean.double(), log_std.double())
+                before = mean.double().clamp(-2, 2) + 0.5 * torch.randn(NUMBER, 2, dtype=torch.float64)
+                scaled = before.tanh()
+                low, high = torch.as_tensor(BOX.low).double(), torch.as_tensor(BOX.high).double()
+                # SB3's is of the scaled action, and adds 1e-6 within the logarithm
+                expected = dist.log_prob(scaled, before) + (1 - scaled**2 + 1e-6).log().sum(-1)
+                expected = expected - ((1 - scaled**2) * (high - low) / 2).log().sum(-1)
+                batch["action"] = low + 0.5 * (scaled + 1) * (high - low)
+                params = {key: value.double() for key, value in prior.get_params(batch).items()}
+                found = prior.log_prob(batch, dist=prior.build_dist(params))
+            else:
+                dist = policy.get_distribution(tensor)
+                batch["action"] = dist.get_actions()
+                expected = dist.log_prob(batch["action"])
+                found = prior.log_prob(batch)
+        torch.testing.assert_close(found, expected, **TOLERANCE)
+
+    def test_round_trip_through_a_file(self, saved: Callable[[str], Saved], name: str, tmp_path: Path) -> None:
+        prior, batch = convert(saved(name), name), batch_of(observations(MODELS[name], 20))
+        save_prior(tmp_path / "teacher", prior, env_id="Noise-v0")
+        loaded = load_prior(tmp_path / "teacher", env_id="Noise-v0")
+        for key, value in prior.get_params(batch).items():
+            assert torch.equal(loaded.get_params(batch)[key], value), key
+        batch["action"] = prior.get_dist(batch).sample()
+        assert torch.equal(loaded.log_prob(batch), prior.log_prob(batch))
+
+    def test_neither_sb3_nor_gymnasium_is_imported(
+        self, saved: Callable[[str], Saved], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        model = saved("ppo")
+        for module in [module for module in sys.modules if module.split(".")[0] in ("stable_baselines3", "gymnasium")]:
+            monkeypatch.setitem(sys.modules, module, None)  # makes the import of it fail
+        convert(model, "ppo")
+
+    def test_no_random_number_is_drawn(self, saved: Callable[[str], Saved]) -> None:
+        model = saved("sac")
+        before = torch.get_rng_state()
+        convert(model, "sac")
+        assert torch.equal(torch.get_rng_state(), before)
+
+    def test_shape_of_the_batch_does_not_matter(self, saved: Callable[[str], Saved], name: str) -> None:
+        prior, raw = convert(saved(name), name), torch.as_tensor(observations(MODELS[name], 6))
+        flat = prior(TensorDict(observation=raw, batch_size=[6]))
+        grid = prior(TensorDict(observation=raw.unflatten(0, (2, 3)), batch_size=[2, 3]))
+        for key in prior.out_keys:
+            torch.testing.assert_close(grid[key].flatten(0, 1), flat[key])
+
+    def test_a_spread_makes_any_continuous_teacher_gaussian(self, saved: Callable[[str], Saved]) -> None:
+        model, batch = saved("sac"), batch_of(observations(MODELS["sac"], 20))
+        squashed = convert(model, "sac").get_dist(batch)
+        normal = load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.3).get_dist(batch)
+        torch.testing.assert_close(normal.mean, squashed.deterministic_sample, **TOLERANCE)
+        assert (normal.stddev == 0.3).all()
+
+    def test_the_command_writes_a_teacher(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        model = saved("ppo")
+        out = str(tmp_path / "teacher.safetensors")
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            overrides = [f"model={model.path}", f"vecnormalize={model.vecnormalize}", "env_id=Noise-v0", f"out={out}"]
+            export(compose("export_sb3", overrides))
+        prior = load_prior(out, env_id="Noise-v0", observation_spec=3, action_spec=2)
+        batch = batch_of(observations(MODELS["ppo"], 5))
+        assert torch.equal(prior.get_dist(batch).mean, convert(model, "ppo").get_dist(batch).mean)
+        with pytest.raises(ArtifactError, match=r"actions of shape \(2,\), and the student's are 3"):
+            load_prior(out, observation_spec=3, action_spec=3)
+        with pytest.raises(ArtifactError, match=r"can't read observations of shape \(4,\)"):
+            load_prior(out, observation_spec=4, action_spec=2)
+        with pytest.raises(ArtifactError, match="policy of Noise-v0"):
+            load_prior(out, env_id="Hopper-v5")
+
+
+class MyPolicy(PPO.policy_aliases["MlpPolicy"]):
+    pass
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("env", "policy", "kwargs", "match"),
+        [
+            ({}, "MlpPolicy", {"use_sde": True}, "use_sde=True"),
+            ({"actions": spaces.MultiDiscrete([2, 3])}, "MlpPolicy", {}, "actions are a MultiDiscrete space"),
+            ({"actions": spaces.MultiBinary(2)}, "MlpPolicy", {}, "actions are a MultiBinary space"),
+            ({"observations": spaces.Discrete(3)}, "MlpPolicy", {}, "observations are a Discrete space"),
+            ({"observations": spaces.Dict(a=BOX)}, "MultiInputPolicy", {}, "observations are a Dict space"),
+            ({}, MyPolicy, {}, "policy class is one of test_sb3"),
+            ({}, "MlpPolicy", {"policy_kwargs": {"activation_fn": nn.Hardtanh}}, "Hardtanh"),
+        ],
+    )
+    def test_policies_that_cannot_be_converted(
+        self, tmp_path: Path, env: dict[str, Any], policy: Any, kwargs: dict[str, Any], match: str
+    ) -> None:
+        PPO(policy, Noise(**env), device="cpu", n_steps=8, batch_size=8, **kwargs).save(tmp_path / "model.zip")
+        with pytest.raises(ArtifactError, match=match) as caught:
+            load_sb3_prior(tmp_path / "model.zip")
+        assert str(tmp_path / "model.zip") in str(caught.value)
+
+    def test_what_contradicts_the_file(self, saved: Callable[[str], Saved]) -> None:
+        with pytest.raises(ValueError, match="pass std"):
+            load_sb3_prior(saved("td3").path)
+        with pytest.raises(ValueError, match="discrete actions"):
+            load_sb3_prior(saved("ppo_discrete").path, std=0.1)
+        with pytest.raises(ValueError, match="contradicts the file, whose policy has 'elu'"):
+            load_sb3_prior(saved("a2c").path, activation="relu")
+        with pytest.raises(ValueError, match="Unknown activation"):
+            load_sb3_prior(saved("ppo").path, activation="sin")
+        with pytest.raises(ArtifactError, match=r"statistics of observations \(3,\)"):
+            load_sb3_prior(saved("ppo_image").path, vecnormalize=saved("ppo").vecnormalize)
+        with pytest.raises(FileNotFoundError):
+            load_sb3_prior("no.zip")
+
+    def test_statistics_that_leave_observations_alone(self, tmp_path: Path) -> None:
+        VecNormalize(DummyVecEnv([Noise]), norm_obs=False).save(str(tmp_path / "vec.pkl"))
+        assert read_vecnormalize(tmp_path / "vec.pkl") is None
+
+    def test_custom_layers_are_named(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        for rename, match in (
+            (("policy_net.2.", "policy_net.3."), r"not a plain stack of linear"),
+            (("value_net.weight", "gate.weight"), r"not known: gate\.weight"),
+            (("action_net.", "act."), r"lacks action_net\.weight"),
+        ):
+            path = rewrite(saved("a2c").path, tmp_path / "model.zip", weights=lambda w, r=rename: renamed(w, *r))
+            with pytest.raises(ArtifactError, match=match):
+                load_sb3_prior(path)
+
+
+def renamed(weights: dict[str, Any], old: str, new: str) -> dict[str, Any]:
+    return {name.replace(old, new): value for name, value in weights.items()}
+
+
+def rewrite(
+    source: Path, target: Path, *, weights: Callable[[Any], Any] = lambda w: w, data: Callable[[Any], Any] = lambda d: d
+) -> Path:
+    """A copy of a model with other content."""
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as out:
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name == "policy.pth":
+                buffer = io.BytesIO()
+                torch.save(weights(torch.load(io.BytesIO(content), weights_only=True)), buffer)
+                content = buffer.getvalue()
+            if name == "data":
+                content = json.dumps(data(json.loads(content))).encode()
+            out.writestr(name, content)
+    return target
+
+
+class Bomb:
+    """Runs when an ordinary unpickler reads it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return Path.touch, (self.path,)
+
+
+class TestNothingRuns:
+    def test_in_statistics(self, tmp_path: Path) -> None:
+        (tmp_path / "vec.pkl").write_bytes(pickle.dumps({"obs_rms": Bomb(tmp_path / "ran")}))
+        with pytest.raises(ArtifactError, match=r"pathlib.*nothing in it was run"):
+            read_vecnormalize(tmp_path / "vec.pkl")
+        assert not (tmp_path / "ran").exists()
+
+    def test_in_a_space_or_the_weights(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        bomb = base64.b64encode(pickle.dumps(Bomb(tmp_path / "ran"))).decode()
+
+        def arm(data: dict[str, Any]) -> dict[str, Any]:
+            data["action_space"][":serialized:"] = bomb
+            data["policy_class"][":serialized:"] = bomb
+            return data
+
+        with pytest.raises(ArtifactError, match="action_space can't be read"):
+            load_sb3_prior(rewrite(saved("a2c").path, tmp_path / "a.zip", data=arm))
+        with pytest.raises(ArtifactError, match=r"policy\.pth can't be read as tensors"):
+            load_sb3_prior(
+                rewrite(saved("a2c").path, tmp_path / "b.zip", weights=lambda w: {**w, "x": Bomb(tmp_path / "ran")})
+            )
+        assert not (tmp_path / "ran").exists()
+
+    @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(data=st.data())
+    def test_damaged_statistics(self, saved: Callable[[str], Saved], tmp_path: Path, data: st.DataObject) -> None:
+        content = bytearray(saved("ppo").vecnormalize.read_bytes())  # type: ignore[union-attr]
+        for _ in range(data.draw(st.integers(1, 4))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+        end = data.draw(st.sampled_from([len(content), len(content) // 2]))
+        (tmp_path / "vec.pkl").write_bytes(content[:end])
+        with contextlib.suppress(ArtifactError):  # nothing else; a number may have changed
+            read_vecnormalize(tmp_path / "vec.pkl")
+
+    @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+    @given(data=st.data())
+    def test_damaged_models(self, saved: Callable[[str], Saved], tmp_path: Path, data: st.DataObject) -> None:
+        content = bytearray(saved("a2c_linear").path.read_bytes())
+        for _ in range(data.draw(st.integers(1, 4))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+        (tmp_path / "model.zip").write_bytes(content)
+        with contextlib.suppress(ArtifactError):  # nothing else; parts that are not read may have changed
+            load_sb3_prior(tmp_path / "model.zip")

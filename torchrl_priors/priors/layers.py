@@ -1,0 +1,189 @@
+"""The layers of teachers that were trained elsewhere, beside those of :mod:`torch.nn`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+__all__ = ["GaussianHead", "NatureCNN", "ScaleToBox", "StateIndependentStd", "TeacherInput"]
+
+
+class TeacherInput(nn.Module):
+    r"""From raw observations to what a teacher's network reads.
+
+    Normalises by frozen statistics, :math:`(x-\mu)/\sqrt{\sigma^2+\epsilon}` clipped, in float64 as NumPy does; divides
+    pixels by 255; flattens; each only if asked to.
+
+    Args:
+        shape (sequence of int): of one raw observation.
+
+    Keyword Args:
+        statistics (tuple of Tensor, optional): mean and variance, each of ``shape``. Defaults to ``None``: raw.
+        eps (float): added to the variance. Defaults to 1e-8.
+        clip (float): bound of what is normalised. Defaults to 10.
+        pixels (bool): whether observations are divided by 255. Defaults to ``False``.
+        flatten (bool): whether an observation becomes a vector. Defaults to ``True``.
+
+    Raises:
+        ValueError: statistics of another shape; at call, observations of another shape.
+
+    Examples:
+        >>> import torch
+        >>> norm = TeacherInput((2,), statistics=(torch.tensor([1.0, 2.0]), torch.tensor([4.0, 1.0])))
+        >>> norm(torch.tensor([[3.0, 2.0]]))
+        tensor([[1., 0.]])
+    """
+
+    def __init__(
+        self,
+        shape: Sequence[int],
+        *,
+        statistics: tuple[Tensor, Tensor] | None = None,
+        eps: float = 1e-8,
+        clip: float = 10.0,
+        pixels: bool = False,
+        flatten: bool = True,
+    ) -> None:
+        super().__init__()
+        self.shape = tuple(shape)
+        self.eps, self.clip = float(eps), float(clip)
+        self.pixels, self.flatten = pixels, flatten
+        self.mean: Tensor | None
+        self.var: Tensor | None
+        for name, value in zip(("mean", "var"), statistics or (None, None), strict=True):
+            if value is not None and tuple(value.shape) != self.shape:
+                raise ValueError(
+                    f"The {name} of observations {self.shape} must be of that shape, got {tuple(value.shape)}."
+                )
+            self.register_buffer(name, None if value is None else value.detach().double().clone())
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """From raw observations ``[*B, *shape]`` to float32 ``[*B, *shape]``, or ``[*B, features]``."""
+        batch_ndim = observation.ndim - len(self.shape)
+        if batch_ndim < 0 or tuple(observation.shape[batch_ndim:]) != self.shape:
+            raise ValueError(
+                f"The teacher reads raw observations of shape [*B, {', '.join(map(str, self.shape))}], got"
+                f" {tuple(observation.shape)}."
+            )
+        if self.mean is not None and self.var is not None:
+            observation = (observation.to(self.mean) - self.mean) / (self.var + self.eps).sqrt()
+            observation = observation.clamp(-self.clip, self.clip)
+        observation = observation.float()
+        if self.pixels:
+            observation = observation / 255.0
+        return observation.reshape(*observation.shape[:batch_ndim], -1) if self.flatten else observation
+
+
+class StateIndependentStd(nn.Module):
+    """A standard deviation that is the same in every state, from a mean ``[*B, A]`` to mean and std ``[*B, A]``.
+
+    Args:
+        log_std (Tensor): its logarithm, ``[A]``.
+
+    Examples:
+        >>> import torch
+        >>> StateIndependentStd(torch.zeros(2))(torch.tensor([3.0, 4.0]))[1]
+        tensor([1., 1.], grad_fn=<ExpandBackward0>)
+    """
+
+    def __init__(self, log_std: Tensor) -> None:
+        super().__init__()
+        self.log_std = nn.Parameter(log_std.detach().clone())
+
+    def forward(self, mean: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean as it is, and the standard deviation."""
+        return mean, self.log_std.exp().expand_as(mean)
+
+
+class GaussianHead(nn.Module):
+    """Mean and standard deviation ``[*B, A]`` from features ``[*B, F]``, its logarithm clamped.
+
+    Args:
+        features (int): F.
+        act_dim (int): A.
+
+    Keyword Args:
+        log_std_range (tuple of float): where the logarithm is clamped. Defaults to ``(-20, 2)``, as in SAC.
+
+    Examples:
+        >>> import torch
+        >>> mean, std = GaussianHead(4, 2)(torch.zeros(7, 4))
+        >>> mean.shape, std.shape
+        (torch.Size([7, 2]), torch.Size([7, 2]))
+    """
+
+    def __init__(self, features: int, act_dim: int, *, log_std_range: tuple[float, float] = (-20.0, 2.0)) -> None:
+        super().__init__()
+        self.mean = nn.Linear(features, act_dim)
+        self.log_std = nn.Linear(features, act_dim)
+        self.log_std_range = tuple(log_std_range)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """The mean and the standard deviation."""
+        return self.mean(features), self.log_std(features).clamp(*self.log_std_range).exp()
+
+
+class ScaleToBox(nn.Module):
+    """Actions from [-1, 1] to the bounds of a box, in the unit of the environment.
+
+    Args:
+        low, high (Tensor): the bounds, ``[A]``.
+
+    Examples:
+        >>> import torch
+        >>> ScaleToBox(torch.tensor([0.0]), torch.tensor([4.0]))(torch.tensor([-1.0]))
+        tensor([0.])
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("low", low.detach().clone())
+        self.register_buffer("high", high.detach().clone())
+
+    def forward(self, action: Tensor) -> Tensor:
+        """From ``[*B, A]`` in [-1, 1] to ``[*B, A]`` in the box."""
+        return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+
+
+class NatureCNN(nn.Module):
+    """The convolutions of Mnih et al., "Human-level control through deep reinforcement learning" (2015).
+
+    Args:
+        shape (sequence of int): channels, height and width of an image.
+        features (int): what it gives. Defaults to 512.
+
+    Examples:
+        >>> import torch
+        >>> NatureCNN((4, 84, 84))(torch.zeros(2, 3, 4, 84, 84)).shape
+        torch.Size([2, 3, 512])
+    """
+
+    def __init__(self, shape: Sequence[int], features: int = 512) -> None:
+        super().__init__()
+        channels, *size = shape
+        for kernel, stride in ((8, 4), (4, 2), (3, 1)):
+            size = [(pixels - kernel) // stride + 1 for pixels in size]
+        if len(size) != 2 or min(size) < 1:
+            raise ValueError(f"The NatureCNN reads images [C, H, W] of 36 x 36 pixels at least, got {tuple(shape)}.")
+        self.shape = tuple(shape)
+        self.features = features
+        self.cnn = nn.Sequential(
+            nn.Conv2d(channels, 32, 8, 4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, 2),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3, 1),
+            nn.ReLU(),
+            nn.Flatten(),
+        )
+        self.linear = nn.Sequential(nn.Linear(64 * math.prod(size), features), nn.ReLU())
+
+    def forward(self, image: Tensor) -> Tensor:
+        """From images ``[*B, C, H, W]`` to ``[*B, features]``."""
+        batch = image.shape[:-3]
+        return self.linear(self.cnn(image.reshape(-1, *self.shape))).reshape(*batch, self.features)

@@ -1,0 +1,39 @@
+"""Weights of discrete actions as log-probabilities that are finite."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = ["check_epsilon", "smoothed_logits"]
+
+
+def smoothed_logits(weights: Tensor, epsilon: float) -> Tensor:
+    r"""The log-probabilities :math:`\log[(1-\epsilon)\,w_a/\sum_b w_b + \epsilon/A]`, ``[*B, A]``.
+
+    Where all weights are 0, nothing is known, and all actions are equally probable.
+
+    Args:
+        weights (Tensor): ``[*B, A]``, not negative; or bool.
+        epsilon (float): how much probability is spread over all actions, in (0, 1].
+
+    Raises:
+        ValueError: a weight is negative or not finite.
+
+    Examples:
+        >>> smoothed_logits(torch.tensor([1.0, 0.0, 1.0, 0.0]), 0.2).exp()
+        tensor([0.4500, 0.0500, 0.4500, 0.0500])
+    """
+    weights = weights if weights.is_floating_point() else weights.to(torch.get_default_dtype())
+    if not torch.compiler.is_compiling() and not (weights.isfinite() & (weights >= 0)).all():
+        raise ValueError("Weights of actions must be finite and not negative.")
+    total = weights.sum(-1, keepdim=True)
+    uniform = torch.full_like(weights, 1 / weights.shape[-1])
+    return torch.where(total > 0, (1 - epsilon) * weights / total + epsilon * uniform, uniform).log()
+
+
+def check_epsilon(epsilon: float) -> float:
+    """Refuses an ``epsilon`` outside of (0, 1]: with 0 some log-probabilities would be infinite."""
+    if not 0 < epsilon <= 1:
+        raise ValueError(f"epsilon is the probability of any action at random, in (0, 1], got {epsilon}.")
+    return float(epsilon)
