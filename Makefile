@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN = $(if $(wildcard $(VENV)/bin/python),$(VENV)/bin/,)
 
-.PHONY: setup check format test
+.PHONY: setup check format docs test test-min
 
 setup:  ## create .venv with everything a contributor needs
 	python3 -m venv $(VENV)
@@ -17,5 +17,13 @@ format:  ## apply the formatting and the safe lint fixes
 	$(BIN)ruff format .
 	$(BIN)ruff check --fix .
 
+docs:  ## the documentation, into site/; a warning is an error
+	$(BIN)python -m mkdocs build --strict
+
 test:  ## doctests and tests
 	$(BIN)python -m pytest -n auto
+
+test-min:  ## the same with the oldest supported versions, in an environment of their own
+	python3 -m venv $(VENV)-min
+	$(VENV)-min/bin/pip install -c constraints-min.txt -e '.[test]'
+	$(VENV)-min/bin/python -m pytest -n auto

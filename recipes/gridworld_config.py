@@ -161,7 +161,7 @@ def check(cfg: GridworldConfig) -> None:
         _require(0 <= value < float("inf"), key, value, "a number of at least 0")
     _require(0 <= cfg.seed < 2**62, "seed", cfg.seed, "a number in [0, 2**62)")
     try:
-        torch.zeros(1, device=cfg.device)
+        torch.zeros(1, device=cfg.device).item()  # the meta device has no numbers
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device={cfg.device}: not available here ({str(error).splitlines()[0]})") from None
     require_compiler(cfg.compile, cfg.device)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import math
 import os
 import re
+import reprlib
 import secrets
+import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import ModuleType
@@ -40,6 +41,7 @@ POLICY, PRIOR = "torchrl_priors.policy", "torchrl_priors.prior"
 _VERSION = 1
 _ARCHITECTURE = "gaussian_mlp"
 _MAX_HEADER = 1 << 20  # bytes: a policy's header has a few thousand, another model's may have many
+_MAX_FILE = 1 << 30  # bytes: a file's bytes are hashed in memory, so what it claims to need has an end
 _NO_DIGEST = "0" * 64
 STATISTICS = ("mean", "var", "count")
 """The buffers of a :class:`~torchrl_priors.collectors.RunningNorm`; a file has them after ``normalizer.``."""
@@ -124,13 +126,15 @@ def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _V
     """The bytes of a file.
 
     Raises:
-        ValueError: the manifest is too long to be read again.
+        ValueError: the manifest, or the whole file, is too long to be read again.
     """
     # the digest comes first, so that no zeros of the manifest are taken for its place
     about = json.dumps({"sha256": _NO_DIGEST, "version": version, "manifest": manifest}, allow_nan=False)
     data = _seal(_safetensors().torch.save(tensors, metadata={kind: about}))
     if int.from_bytes(data[:8], "little") > _MAX_HEADER:
         raise ValueError(f"This policy can't be saved: its manifest is longer than {_MAX_HEADER} bytes.")
+    if len(data) > _MAX_FILE:
+        raise ValueError(f"This policy can't be saved: it has {len(data)} bytes, and a file at most {_MAX_FILE}.")
     return data
 
 
@@ -176,7 +180,7 @@ def read_file(path: Path) -> tuple[dict[str, Tensor], PolicyManifest | PriorMani
         version = about.get("version")
         if type(version) is not int or version != _VERSION:
             raise ArtifactError(
-                f"it is of version {version!r}, and this release reads version {_VERSION}: it may need a"
+                f"it is of version {reprlib.repr(version)}, and this release reads version {_VERSION}: it may need a"
                 " newer torchrl_priors"
             )
         digest = about.get("sha256")
@@ -212,56 +216,70 @@ def _read_bytes(path: Path) -> tuple[bytes, str, dict[str, Any]]:
         try:
             if len(header) < size:
                 raise ValueError
-            metadata = json.loads(header)["__metadata__"]
+            metadata = json.loads(header.decode(), object_pairs_hook=_refuse_duplicates)["__metadata__"]
         except (ValueError, TypeError, KeyError, RecursionError):  # JSON and UTF-8 errors are ValueErrors
             raise ArtifactError("it is truncated, or not a safetensors file with metadata") from None
         try:
             kind = next(kind for kind in (POLICY, PRIOR) if kind in metadata)
-            about = json.loads(metadata[kind], parse_constant=_refuse_constant)
+            about = json.loads(metadata[kind], parse_constant=_refuse_constant, object_pairs_hook=_refuse_duplicates)
         except (TypeError, StopIteration):
             raise ArtifactError("it is a safetensors file, but not one of torchrl_priors.save_policy") from None
         except (ValueError, RecursionError):
             raise ArtifactError("it is damaged: its manifest is not JSON") from None
         if not isinstance(about, dict):
             raise ArtifactError("it is damaged: its manifest is not an object")
+        if (size := os.fstat(file.fileno()).st_size) > _MAX_FILE:
+            raise ArtifactError(f"it has {size} bytes, and a policy at most {_MAX_FILE}")
         file.seek(0)
-        return file.read(), kind, about
+        return file.read(size), kind, about
 
 
 def _refuse_constant(name: str) -> None:
     raise ValueError(f"{name} is not JSON")
 
 
+def _refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON; of two entries of one name, readers would differ about which one counts."""
+    if len(values := dict(pairs)) < len(pairs):
+        raise ValueError("an entry twice")
+    return values
+
+
 def parse_manifest(values: Any) -> PolicyManifest:
-    """A manifest from JSON, checked entry by entry."""
+    """A manifest from JSON, checked entry by entry. What a message shows of it is short and printable."""
     names = {item.name for item in fields(PolicyManifest)}
     if not isinstance(values, dict) or values.keys() != names:
         raise ArtifactError(f"its manifest must have the entries {', '.join(sorted(names))}")
     if values["architecture"] != _ARCHITECTURE:
-        raise ArtifactError(f"its architecture is unknown: {values['architecture']!r}, expected {_ARCHITECTURE!r}")
+        raise ArtifactError(
+            f"its architecture is unknown: {reprlib.repr(values['architecture'])}, expected {_ARCHITECTURE!r}"
+        )
     if not isinstance(values["activation"], str) or values["activation"] not in ACTIVATIONS:
-        raise ArtifactError(f"its activation is unknown: {values['activation']!r}")
-    if not isinstance(values["env_id"], str) or not values["env_id"]:
-        raise ArtifactError(f"it must name its environment, got env_id={values['env_id']!r}")
+        raise ArtifactError(f"its activation is unknown: {reprlib.repr(values['activation'])}")
+    env_id = values["env_id"]
+    if not isinstance(env_id, str) or not env_id or not env_id.isprintable():  # messages show it
+        raise ArtifactError(f"it must name its environment, got env_id={reprlib.repr(env_id)}")
     normalizer = values["normalizer"]
     if normalizer is not None and (
         not isinstance(normalizer, dict)
         or normalizer.keys() != {"eps", "clip"}
-        or not all(type(value) in (int, float) and 0 < value < math.inf for value in normalizer.values())
+        or not all(type(value) in (int, float) and 0 < value <= sys.float_info.max for value in normalizer.values())
     ):
-        raise ArtifactError(f"its normalizer must be null or have a positive eps and clip, got {normalizer!r}")
+        raise ArtifactError(
+            f"its normalizer must be null or have a positive eps and clip, got {reprlib.repr(normalizer)}"
+        )
     hidden = values["hidden"]
     if not isinstance(hidden, list) or not all(_is_count(size, 1) for size in hidden):
-        raise ArtifactError(f"its hidden layers must have positive sizes, got {hidden!r}")
+        raise ArtifactError(f"its hidden layers must have positive sizes, got {reprlib.repr(hidden)}")
     for name in ("obs_dim", "act_dim"):
         if not _is_count(values[name], 1):
-            raise ArtifactError(f"its {name} must be a positive integer, got {values[name]!r}")
+            raise ArtifactError(f"its {name} must be a positive integer, got {reprlib.repr(values[name])}")
     for name in ("seed", "frames"):
         if values[name] is not None and not _is_count(values[name], 0):
-            raise ArtifactError(f"its {name} must be an integer of at least 0, got {values[name]!r}")
+            raise ArtifactError(f"its {name} must be an integer of at least 0, got {reprlib.repr(values[name])}")
     for name in ("evaluation", "training"):
         if not isinstance(values[name], dict):
-            raise ArtifactError(f"its {name} must be an object of JSON, got {values[name]!r}")
+            raise ArtifactError(f"its {name} must be an object of JSON, got {reprlib.repr(values[name])}")
     return PolicyManifest(**{**values, "hidden": tuple(hidden)})
 
 
@@ -295,12 +313,17 @@ def check_tensors(tensors: dict[str, Tensor], manifest: PolicyManifest) -> None:
             expected[f"normalizer.{name}"] = () if name == "count" else (manifest.obs_dim,), torch.float64
     if tensors.keys() != expected.keys():
         differing = sorted(tensors.keys() ^ expected.keys())
-        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {', '.join(differing)}")
+        shown = ", ".join(name if name.isprintable() else ascii(name) for name in differing[:5])
+        more = f" and {len(differing) - 5} more" if len(differing) > 5 else ""
+        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {shown[:500]}{more}")
     for name, (shape, dtype) in expected.items():
         value = tensors[name]
         if tuple(value.shape) != shape or value.dtype is not dtype:
             raise ArtifactError(f"{name} must be {dtype} of shape {shape}, got {value.dtype} of {tuple(value.shape)}")
         if not value.isfinite().all():
             raise ArtifactError(f"{name} is not finite: it has NaN or infinite entries")
+    deviation = tensors["actor.scale.state_independent_scale"].exp()
+    if not (deviation.isfinite() & (deviation > 0)).all():
+        raise ArtifactError("its standard deviations, the exponentials of state_independent_scale, overflow or vanish")
     if manifest.normalizer is not None and ((tensors["normalizer.var"] < 0).any() or tensors["normalizer.count"] < 0):
         raise ArtifactError("the statistics of its observations have a negative variance or count")

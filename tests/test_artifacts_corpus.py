@@ -1,0 +1,109 @@
+"""A thousand damaged and foreign files: each is refused with a reason, none does anything."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+import torch
+from artifact_corpus import not_files, write_corpus
+
+from torchrl_priors.artifacts import load_policy, load_prior, read_manifest, save_policy
+from torchrl_priors.collectors.running_norm import RunningNorm
+from torchrl_priors.networks import make_actor
+
+# Reads every file of a folder in a process of its own, with little memory, and tells what came of it. What the readers
+# do to the machine is seen by an audit hook: files that are opened, code that is compiled, imported or unpickled,
+# processes and connections.
+READER = """
+import json, resource, sys
+from pathlib import Path
+from torchrl_priors.artifacts import load_policy, load_prior, read_manifest
+
+folder, good = Path(sys.argv[1]), sys.argv[2]
+load_policy(good), load_prior(good), read_manifest(good)  # what is imported late, is imported now
+events, opened, watching = set(), set(), False
+
+def hook(event, args):
+    if watching:
+        events.add(event)
+        if event == "open":
+            opened.add((str(args[0]), str(args[1])))
+
+sys.addaudithook(hook)
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 2**30, used + 2**30))
+outcomes = {}
+for path in sorted(folder.iterdir()):
+    outcome = []
+    for reader in (load_policy, load_prior, read_manifest):
+        watching = True
+        try:
+            reader(path)
+            error = None
+        except BaseException as caught:
+            error = caught
+        watching = False
+        outcome.append([type(error).__name__, str(error)])
+    outcomes[path.name] = outcome
+print(json.dumps({"outcomes": outcomes, "events": sorted(events), "opened": sorted(opened)}))
+"""
+
+
+def snapshot(folder: Path) -> dict[str, tuple[int, int]]:
+    """Sizes and times of last change, of every file there is."""
+    return {path.name: (path.stat().st_size, path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("good") / "policy.safetensors"
+    normalizer = RunningNorm(3)
+    normalizer.update(torch.randn(50, 3) + 3)
+    save_policy(path, make_actor(3, 2, hidden=(4,)), normalizer, env_id="Hopper-v5", seed=0, frames=1)
+    return path
+
+
+def test_a_thousand_damaged_and_foreign_files_are_refused_and_do_nothing(good: Path, tmp_path: Path) -> None:
+    corpus, elsewhere = tmp_path / "corpus", tmp_path / "elsewhere"
+    corpus.mkdir()
+    elsewhere.mkdir()
+    write_corpus(corpus, good.read_bytes(), asdict(read_manifest(good)), seed=0)
+    before = snapshot(corpus)
+    command = [sys.executable, "-c", READER, str(corpus), str(good)]
+    done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]  # no crash
+    told = json.loads(done.stdout)
+
+    assert len(told["outcomes"]) == len(before) >= 1000
+    wrong = {
+        name: outcome
+        for name, outcome in told["outcomes"].items()
+        if not all(kind == "ArtifactError" and str(corpus / name) in message for kind, message in outcome)
+    }
+    assert wrong == {}
+    messages = [message for outcome in told["outcomes"].values() for _, message in outcome]
+    assert all(message.isprintable() and len(message) < 2000 for message in messages)
+    assert len(Counter(message.partition(": ")[2] for message in messages)) > 100  # reasons, not one for all
+
+    assert told["events"] == ["open"]  # nothing was compiled, imported, unpickled, started or sent
+    assert {mode for _, mode in told["opened"]} <= {"r", "rb"}
+    assert {Path(path).parent for path, _ in told["opened"]} == {corpus}
+    assert snapshot(corpus) == before
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_what_is_no_file_is_said_to_be_none(tmp_path: Path) -> None:
+    paths = list(not_files(tmp_path))
+    for path in paths:
+        for reader in (load_policy, load_prior, read_manifest):
+            with pytest.raises(FileNotFoundError, match="No policy file at") as caught:
+                reader(path)
+            assert str(path) in str(caught.value)
+    assert set(tmp_path.iterdir()) == set(paths[:-1])

@@ -1,0 +1,135 @@
+"""What the documentation tells a reader to type works; what it says of the library is there."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from test_readme import a_readers_own_objects
+from torchrl.objectives.value import GAE
+
+from torchrl_priors import METHODS, ActionPrior, PriorBonus, PriorLogProb, PriorWeight
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = {path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))}
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.DOTALL | re.MULTILINE)
+
+# What makes the commands short: appended to each of a recipe. Lengths and sizes only, never what is shown.
+SHORT = {
+    "recipes.gridworld": "worlds=2 teacher.steps=200 teacher.eval_episodes=1 evaluation.points=3 "
+    "evaluation.interval=20 bootstrap.reps=20 compile=false workers=1",
+    "recipes.mujoco": "env.num_envs=2 env.frames_per_batch=64 env.minibatch_size=32 total_frames=128 ppo.epochs=1 "
+    "ppo.hidden=[8] evaluation.interval=64 evaluation.episodes=1 checkpoint.interval=128 compile=false",
+    "recipes.report": "bootstrap.reps=20",
+    "recipes.export_best": "",
+}
+
+
+def blocks(language: str) -> dict[str, list[str]]:
+    found = {page: [code for name, code in BLOCK.findall(text) if name == language] for page, text in PAGES.items()}
+    return {page: codes for page, codes in found.items() if codes}
+
+
+def run(command: str, folder: Path) -> int | str | None:
+    """Run a recipe's command in this process, shortened, in a folder; what it exits with."""
+    words = command.split()
+    assert words[:2] == ["python", "-m"], f"{command}: no command that a test knows to run"
+    assert words[2] in SHORT, f"{command}: no recipe that a test knows to make short"
+    more = ["hydra.launcher.n_jobs=1"] if "-m" in words[3:] else []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
+        patch.setattr(sys, "argv", [words[2], *words[3:], *SHORT[words[2]].split(), *more])
+        try:
+            importlib.import_module(words[2]).main()
+        except SystemExit as end:
+            return end.code
+    return None
+
+
+def test_every_block_is_of_a_language_that_is_run() -> None:
+    assert {name for text in PAGES.values() for name, _ in BLOCK.findall(text)} == {"bash", "python"}
+
+
+@pytest.mark.parametrize("page", blocks("bash"))
+def test_commands_run_in_their_order(page: str, tmp_path: Path) -> None:
+    for code in blocks("bash")[page]:
+        for command in code.strip().splitlines():
+            assert run(command, tmp_path) in (None, 0), command
+    assert (tmp_path / "results/gridworld/original/area_ratio.csv").exists()
+    assert (tmp_path / "outputs/report/report.md").exists()
+
+
+def names_of_the_first_page() -> dict[str, Any]:
+    """What the loop of the first page has made before it starts."""
+    names = a_readers_own_objects()
+    prior, weight = ActionPrior(names["teacher"]), PriorWeight(names["weight_net"])
+    return {**names, "prior": prior, "weight": weight, "log_prob": PriorLogProb(prior, names["actor"])}
+
+
+@pytest.mark.parametrize("page", blocks("python"))
+def test_examples_run_in_their_order(page: str) -> None:
+    names = names_of_the_first_page()
+    for number, code in enumerate(blocks("python")[page]):
+        exec(compile(code, f"{page}, example {number}", "exec"), names)
+    with torch.no_grad():  # as a collector does
+        data = names["log_prob"](names["env"].rollout(20, names["actor"]))
+        shaped = names.get("bonus", PriorBonus(shift="none"))(data)
+        batch = GAE(gamma=0.99, lmbda=0.95, value_network=names["critic"])(shaped)
+    for name in ("loss", "loss_prior"):
+        if name in names:
+            losses = names[name](batch.copy())
+            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            assert all(value.isfinite().all() for value in losses.values())
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_a_page(method: str) -> None:
+    text = PAGES[f"methods/{method}.md"]
+    for part in ("$$", "**Notes.**", "**Can I use it?**", "**Results.**", "**How to replicate.**"):
+        assert part in text, part
+
+
+def test_everything_public_is_in_the_api() -> None:
+    shown: set[int] = set()
+    for path in re.findall(r"^::: ([\w.]+)$", "\n".join(PAGES.values()), flags=re.MULTILINE):
+        head, _, name = path.rpartition(".")
+        found = getattr(importlib.import_module(head), name, None)
+        if found is None or type(found).__name__ == "module":
+            module = importlib.import_module(path)
+            shown |= {id(getattr(module, public)) for public in module.__all__}
+        else:
+            shown.add(id(found))
+    for package in ("torchrl_priors", "torchrl_priors.artifacts", "torchrl_priors.collectors"):
+        module = importlib.import_module(package)
+        assert [name for name in module.__all__ if id(getattr(module, name)) not in shown] == []
+
+
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    if shutil.which("mkdocs", path=str(Path(sys.executable).parent)) is None:
+        pytest.skip("mkdocs is not installed beside this Python")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    page = (tmp_path / "site/methods/ae2r/index.html").read_text(encoding="utf-8")
+    formulas = re.findall("<math.*?</math>", page, flags=re.DOTALL)
+    assert len(formulas) > 5
+    assert not any("\\" in formula or "&#x0005C;" in formula for formula in formulas)  # LaTeX that was not understood
+    assert "arithmatex" not in page
+    assert "<table>" in page
+
+
+def test_no_page_needs_the_network() -> None:
+    """The theme loads neither fonts nor scripts of another host."""
+    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    assert "font: false" in config
+    assert "extra_javascript" not in config
