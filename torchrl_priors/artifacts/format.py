@@ -289,7 +289,7 @@ def parse_prior_manifest(values: Any) -> PriorManifest:
     if not isinstance(values, dict) or values.keys() != names:
         raise ArtifactError(f"its manifest must have the entries {', '.join(sorted(names))}")
     if not isinstance(values["env_id"], str) or not values["env_id"] or not values["env_id"].isprintable():
-        raise ArtifactError(f"it must name its environment, got env_id={reprlib.repr(values["env_id"])}")
+        raise ArtifactError(f"it must name its environment, got env_id={reprlib.repr(values['env_id'])}")
     for name in ("prior", "evaluation", "training"):
         if not isinstance(values[name], dict):
             raise ArtifactError(f"its {name} must be an object of JSON, got {values[name]!r}")
