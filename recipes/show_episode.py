@@ -80,11 +80,12 @@ def weigh(agent: Agent, episode: TensorDictBase) -> dict[str, Tensor | None]:
     delta = td_residual(
         value, episode["next", "reward"], next_value, episode["next", "terminated"], agent.cfg.ppo.gamma
     )
-    degraded, prior = None, agent.loss.prior_loss.prior  # type: ignore[union-attr]
+    loss: Any = agent.loss
+    degraded, prior = None, loss.prior_loss.prior
     if isinstance(prior, StructuralDegradation):
         degraded = prior.mask(episode).reshape(-1)
     elif agent.cfg.prior.degrade == "random":
-        degraded = episode[prior.draw_key].reshape(-1)  # type: ignore[index]
+        degraded = episode[prior.draw_key].reshape(-1)
     weight = agent.weight(episode.copy())["prior_weight"]
     rows = {"weight": weight, "log_prob": episode["prior_log_prob"], "td_error": delta}
     return {name: row.reshape(-1) for name, row in rows.items()} | {"degraded": degraded}
@@ -104,7 +105,7 @@ def render(env_id: str, kwargs: Any, actions: np.ndarray, seed: int) -> tuple[li
         frames = []
         for action in actions:
             frames.append(np.asarray(env.render()))
-            env.step(np.clip(action, env.action_space.low, env.action_space.high))  # type: ignore[attr-defined]
+            env.step(np.clip(action, env.action_space.low, env.action_space.high))
     except Exception as error:  # OpenGL's many ways to fail
         raise ValueError(
             f"MuJoCo cannot draw here ({type(error).__name__}: {error}): set MUJOCO_GL=egl or MUJOCO_GL=osmesa, and"

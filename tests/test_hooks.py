@@ -55,6 +55,13 @@ def test_transforms_have_the_keys_of_the_loss() -> None:
     assert bonus.out_keys == [("next", "agent", "prior_bonus"), ("next", "agent", "shaped")]
 
 
+def test_the_kl_penalty_of_a_loss_reads_the_students_log_probability() -> None:
+    loss = make_loss("kl_penalty")
+    loss.set_keys(sample_log_prob=("agent", "log_prob"))
+    bonus = PriorBonus.from_loss(loss)
+    assert (bonus.shift, bonus.relative, bonus.student_log_prob_key) == ("current", True, ("agent", "log_prob"))
+
+
 @pytest.mark.parametrize("method", ["none", "kickstart"])
 def test_methods_without_a_bonus_leave_the_reward_as_it_is(method: str) -> None:
     bonus = PriorBonus.from_loss(make_loss(method))

@@ -12,6 +12,8 @@ from mujoco_cases import Interrupted, run
 
 from recipes import mujoco as recipe
 
+pytestmark = pytest.mark.usefixtures("without_torchrls_groups")
+
 
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory):

@@ -149,6 +149,7 @@ class TestConversion:
         torch.testing.assert_close(normal.mean, squashed.deterministic_sample, **TOLERANCE)
         assert (normal.stddev == 0.3).all()
 
+    @pytest.mark.usefixtures("without_torchrls_groups")
     def test_the_command_writes_a_teacher(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
         model = saved("ppo")
         out = str(tmp_path / "teacher.safetensors")

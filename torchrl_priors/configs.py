@@ -97,11 +97,12 @@ def make_prior_log_prob(**settings: Any) -> PriorLogProb:
 
 
 def make_prior_bonus(method: str | None = None, **settings: Any) -> PriorBonus:
-    """What ``transform: prior_bonus`` builds; ``method`` stands for ``shift``."""
+    """What ``transform: prior_bonus`` builds; ``method`` stands for ``shift`` and ``relative``."""
     settings = _settings(settings)
     if method is None:
         return PriorBonus(**settings)
-    settings.pop("shift", None)
+    for name in ("shift", "relative"):
+        settings.pop(name, None)
     return PriorBonus.from_method(method, **settings)
 
 

@@ -139,7 +139,8 @@ class PriorBonus(BatchTransform):
         """The bonus that belongs to a loss: with its weight, its method, its coefficient and its keys.
 
         Args:
-            loss (AE2RLoss or ClipPPOPriorLoss): as it is now; later changes of its coefficients or keys are not seen.
+            loss (AE2RLoss or ClipPPOPriorLoss): as it is now; later changes of its coefficients or keys are not seen:
+                where a schedule changes the loss's ``bonus_coeff``, give the transform's a scheduler of its own.
             **kwargs: further keyword arguments of the class, or others than the loss's.
 
         Raises:
@@ -158,6 +159,7 @@ class PriorBonus(BatchTransform):
             shaped = "shaped_reward"
         settings: dict[str, Any] = {
             "shift": inner.spec.bonus,
+            "relative": inner.spec.relative,
             "bonus_coeff": inner.bonus_coeff.item(),
             "centering": inner.centering,
             "reward_key": keys.reward,
@@ -166,6 +168,8 @@ class PriorBonus(BatchTransform):
             "center_key": keys.prior_center,
             "out_keys": [under_next(keys.prior_bonus), under_next(shaped)],
         }
+        if hasattr(loss.tensor_keys, "sample_log_prob"):
+            settings["student_log_prob_key"] = loss.tensor_keys.sample_log_prob
         return cls(inner.prior_weight if inner.spec.adaptive else None, **{**settings, **kwargs})
 
     @torch.no_grad()
