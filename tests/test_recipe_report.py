@@ -98,7 +98,9 @@ def test_settings_without_effect_on_a_method_do_not_split_it(tmp_path: Path) -> 
 def test_settings_of_an_option_that_was_not_chosen_do_not_split_a_method(tmp_path: Path) -> None:
     chosen = [("trust", 100, 1.0), ("trust", 100, 0.03), ("minibatch", 100, 1.0), ("minibatch", 200, 1.0)]
     for seed, (trained, listen, coeff) in enumerate(chosen):
-        settings = {"weight": {"trained": trained, "listen": listen, "lr_coeff": coeff, "init_bias": 0.0}}
+        settings = {
+            "weight": {"trained": trained, "listen": listen, "lr_coeff": coeff, "init_bias": 0.0, "min_trust": 0.7}
+        }
         write_run(tmp_path / str(seed), method="aligned", seed=seed, config=settings)
     assert study_of(tmp_path).labels == ["aligned trained=minibatch", "aligned trained=trust"]
 
