@@ -255,7 +255,7 @@ def train(cfg: MujocoConfig, run: Run) -> None:
             for quantile in (5, 50, 95):
                 metrics[f"prior_weight_q{quantile:02d}"] = weight.quantile(quantile / 100)
         if isinstance(agent.weight, PriorTrust):
-            metrics["prior_trust"] = agent.weight.mean_trust
+            metrics["prior_trust"] = agent.weight.mean_trust.nan_to_num(0.0)  # before it decides
         metrics |= {name: torch.tensor(scheduler.value) for name, scheduler in schedulers.items()}
         run.log(collector.frames, metrics, weight)
         for scheduler in schedulers.values():

@@ -36,6 +36,7 @@ class ReportConfig:
     with_prior: list[str] = MISSING
     with_bonus: list[str] = MISSING
     with_weight: list[str] = MISSING
+    only_for: dict[str, str] = MISSING
     abbreviate: dict[str, str] = MISSING
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
 
@@ -52,6 +53,9 @@ def check(cfg: ReportConfig) -> None:
     refuse_unknown_keys(cfg)
     if cfg.pairing not in ("seed", "mean"):
         raise ValueError(f"pairing={cfg.pairing}: expected seed or mean.")
+    for key, choices in cfg.only_for.items():
+        if choices.count("=") != 1:
+            raise ValueError(f"only_for.{key}={choices}: expected another key and its choices, such as key=a|b.")
     if not 0 < cfg.bootstrap.confidence < 1:
         raise ValueError(f"bootstrap.confidence={cfg.bootstrap.confidence}: expected a number in (0, 1).")
     if cfg.bootstrap.reps < 1:

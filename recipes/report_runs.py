@@ -50,6 +50,9 @@ class LeftOut:
     reason: str
 
 
+_UNREAD = "(not read)"  # the value of a setting without effect, equal to any other
+
+
 class _UnusableError(Exception):
     """Why a run is left out."""
 
@@ -189,7 +192,8 @@ def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
         run.prior = ", ".join([kind, *settings])
     differences = _differences(runs, lambda run: run.method, lambda run: _method_settings(run, cfg))
     for run, told in zip(runs, differences, strict=True):
-        settings = (f"{cfg.abbreviate.get(key, key)}={_short(value)}" for key, value in told.items())
+        read = {cfg.abbreviate.get(key, key): _short(value) for key, value in told.items() if value != _UNREAD}
+        settings = (f"{key}={value}" for key, value in read.items())
         label = " ".join([run.method, *settings])
         run.label = cfg.rename.get(label, label)
 
@@ -212,10 +216,11 @@ def _differences(
     for run in runs:
         for key, value in settings(run).items():
             values[kind(run), run.env, key].append(json.dumps(value, sort_keys=True, default=str))
+    unread = json.dumps(_UNREAD)
     varied = {
         (name, key)
         for (name, env, key), found in values.items()
-        if len(set(found)) > 1 or len(found) < counts[name, env]
+        if len({*found} - {unread}) > 1 or len(found) < counts[name, env]
     }
     return [
         {key: settings(run).get(key, "default") for name, key in sorted(varied) if name == kind(run)} for run in runs
@@ -238,9 +243,13 @@ def _method_settings(run: Run, cfg: ReportConfig) -> dict[str, Any]:
     annealed = run.method != "none" and (spec.annealed or run.settings.get("schedule.methods") == "all")
     patterns += [] if annealed else ["schedule.*"]
     patterns.append("method")
-    return {
-        key: value for key, value in run.settings.items() if not any(fnmatchcase(key, pattern) for pattern in patterns)
-    }
+    unread: dict[str, Any] = {}
+    for key, choices in cfg.only_for.items():
+        option, chosen = choices.split("=")
+        if run.settings.get(option, chosen) not in (chosen, *chosen.split("|")):
+            unread[key] = _UNREAD
+    settings = run.settings | unread
+    return {key: value for key, value in settings.items() if not any(fnmatchcase(key, pattern) for pattern in patterns)}
 
 
 def _short(value: Any) -> str:
