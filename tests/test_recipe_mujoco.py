@@ -220,11 +220,11 @@ def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path)
 
 
 def test_a_missing_compiler_is_told_of_before_training(tmp_path, monkeypatch):
-    monkeypatch.setattr("torch._inductor.config.cpp.cxx", (None, "no-such-compiler"))
     monkeypatch.delenv("CXX", raising=False)
     cpp_builder = pytest.importorskip("torch._inductor.cpp_builder")
     cpp_builder.cpp_compiler_search.cache_clear()
-    with pytest.raises(SystemExit, match=r"compile=true: no C.. compiler .* compile=false"):
+    nowhere = torch._inductor.config.patch({"cpp.cxx": (None, "no-such-compiler")})  # monkeypatch can't undo that
+    with nowhere, pytest.raises(SystemExit, match=r"compile=true: no C.. compiler .* compile=false"):
         run(tmp_path / "out", "compile=true")
     cpp_builder.cpp_compiler_search.cache_clear()
     assert not (tmp_path / "out").exists()
