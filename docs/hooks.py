@@ -12,7 +12,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[1]
-STUDIES = ("original", "shaped", "beyond")
+STUDIES = ("original", "shaped", "beyond", "comparisons")
 _INCLUDE = re.compile(r'^--8<-- "([\w.]+)(?::(\w+))?"$', flags=re.MULTILINE)
 _FILE_LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?://|#)[^)]+\)")
 _TABLE = re.compile(r"<!-- area ratios: ([\w, ]+) -->")
@@ -56,6 +56,8 @@ def area_ratios(methods: list[str]) -> str:
                 iqm, low, high = (round(1000 * float(row[name])) for name in ("iqm", "ci_low", "ci_high"))
                 found.setdefault((study, row["method"]), {})[row["prior"]] = f"{iqm} ({low}, {high})"
                 priors[row["prior"]] = None
+    for method in {method for study, method in found if study == "beyond"}:
+        found.pop(("comparisons", method), None)  # the same worlds and numbers once more
     columns = [(study, method) for method in methods for study in STUDIES if (study, method) in found]
     if not columns:
         raise ValueError(f"No study has the methods {', '.join(methods)}.")
