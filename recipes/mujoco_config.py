@@ -218,9 +218,11 @@ def _check_env(cfg: MujocoConfig) -> tuple[int, int]:
         check_vector_env(env)
         env.close()
         return env.single_observation_space.shape[0], env.single_action_space.shape[0]
-    except ImportError:
-        raise
     except Exception as error:  # Gymnasium's own, or whatever its environments raise
+        if (
+            isinstance(error, ImportError) and ":" not in name
+        ):  # MuJoCo is not installed; a:b is module a, environment b
+            raise
         given = "".join(f", {key}={value}" for key, value in cfg.env.kwargs.items())
         raise ValueError(f"env={name}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
