@@ -16,7 +16,7 @@ from typing import Any
 import hydra
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -76,6 +76,17 @@ class OracleWeight(nn.Module):
         return (observation[..., self.feature, None] <= self.threshold).to(observation.dtype)
 
 
+def make_weight(cfg: MujocoConfig, obs_dim: int) -> TensorDictModuleBase:
+    """The prior weight. One without parameters draws no random numbers: where it is 0 the run is that of PPO."""
+    if cfg.weight.trained == "oracle":
+        oracle = OracleWeight(cfg.prior.feature, cfg.prior.threshold)
+        return TensorDictModule(oracle, in_keys=["observation"], out_keys=["prior_weight"])
+    if cfg.weight.trained == "trust":
+        listen, min_trust = cfg.weight.listen, cfg.weight.min_trust
+        return PriorTrust(obs_dim, listen=listen, min_trust=min_trust, in_keys=["observation_norm"])
+    return make_prior_weight(obs_dim, list(cfg.ppo.hidden), init_bias=cfg.weight.init_bias)
+
+
 class Agent(nn.Module):
     """The networks of a run, its loss, and how a rollout is prepared for it."""
 
@@ -106,19 +117,11 @@ class Agent(nn.Module):
             return
         prior = make_prior(cfg, env_id, obs_dim, act_dim)
         if spec.adaptive:
-            self.weight = make_prior_weight(obs_dim, hidden, init_bias=cfg.weight.init_bias)
-            if cfg.weight.trained == "oracle":
-                oracle = OracleWeight(cfg.prior.feature, cfg.prior.threshold)
-                self.weight = TensorDictModule(oracle, in_keys=["observation"], out_keys=["prior_weight"])
-            if cfg.weight.trained == "trust":
-                self.weight = PriorTrust(
-                    obs_dim, listen=cfg.weight.listen, min_trust=cfg.weight.min_trust, in_keys=["observation_norm"]
-                )
-            if cfg.weight.trained in ("oracle", "trust"):
+            self.weight = make_weight(cfg, obs_dim)
+            if not [*self.weight.parameters()]:
                 options["weight_target"] = "none"
             elif cfg.td_error == "original" and spec.weight_target == "td":
                 self.raw_critic = make_critic(obs_dim, hidden)
-        self.prior = prior
         self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=options["centering"]))
         if spec.bonus != "none":
             bonus = PriorBonus.from_method(
@@ -175,7 +178,8 @@ class Agent(nn.Module):
         rollout = self.advantage(rollout)
         if isinstance(self.weight, PriorTrust) and not self.weight.decided:
             # until it has decided there is no bonus either, so that this is an advantage on raw rewards
-            dist, prior_dist = self.actor.get_dist(rollout.copy()), self.prior.get_dist(rollout.copy())
+            prior = self.transforms[0].prior
+            dist, prior_dist = self.actor.get_dist(rollout.copy()), prior.get_dist(rollout.copy())
             evidence = advice_evidence(rollout["advantage"], rollout["prior_log_prob"], dist, prior_dist)
             self.weight.update(rollout["observation_norm"], evidence)
         # Fewer entries make for faster minibatches.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
@@ -38,3 +39,18 @@ def run(out: Path, *overrides: str) -> Path:
 
 class Interrupted(BaseException):
     """Stands for a kill between two rollouts."""
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *overrides: str) -> None:
+    """Start a run that is broken off after the rollout that ends at ``frames``."""
+    log = recipe.Run.log
+
+    def stopping(self, at, *args):
+        log(self, at, *args)
+        if at == frames:
+            raise Interrupted
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recipe.Run, "log", stopping)
+        with pytest.raises(Interrupted):
+            run(out, *overrides)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
-from mujoco_cases import ROOT, TINY, Interrupted, config, run
+from mujoco_cases import ROOT, TINY, config, interrupt, run
 from tensordict import TensorDict
 
 pytest.importorskip("mujoco")
@@ -62,6 +62,15 @@ def test_a_weight_trained_after_the_rollout_is_the_only_thing_trained_then(teach
     assert set(agent.networks()) == {"actor", "critic", "weight", "raw_critic"}
 
 
+def test_a_teacher_that_is_dropped_leaves_the_run_of_ppo_bit_by_bit(teacher, tmp_path):
+    alone = run(tmp_path / "alone")
+    options = ["method=aligned", "weight.trained=trust", "weight.listen=100", f"prior.path={teacher}"]
+    dropped = run(tmp_path / "dropped", *options, "weight.min_trust=1")
+    trusted = run(tmp_path / "trusted", *options, "weight.min_trust=0")
+    assert (dropped / "eval.csv").read_bytes() == (alone / "eval.csv").read_bytes()
+    assert (trusted / "eval.csv").read_bytes() != (alone / "eval.csv").read_bytes()
+
+
 def test_the_oracle_trusts_exactly_the_states_whose_advice_is_right(teacher, tmp_path):
     options = ["method=aligned", f"prior.path={teacher}", "weight.trained=oracle", "prior.threshold=0.1"]
     cfg = config(tmp_path, *options, "prior.degrade=structural")
@@ -88,17 +97,8 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
     options += [] if method == "none" else [f"prior.path={teacher}", "prior.degrade=random"]
     whole = run(tmp_path / "whole", *options)
     for stop in (128, 192):
-        out, log = tmp_path / f"stopped-{stop}", recipe.Run.log
-
-        def stopping(self, frames, *args, log=log, stop=stop):
-            log(self, frames, *args)
-            if frames == stop:
-                raise Interrupted
-
-        with monkeypatch.context() as patch:
-            patch.setattr(recipe.Run, "log", stopping)
-            with pytest.raises(Interrupted):
-                run(out, *options)
+        out = tmp_path / f"stopped-{stop}"
+        interrupt(monkeypatch, out, stop, *options)
         run(out, *options)
         assert (out / "eval.csv").read_bytes() == (whole / "eval.csv").read_bytes()
         assert (out / "policy.safetensors").read_bytes() == (whole / "policy.safetensors").read_bytes()

@@ -8,9 +8,7 @@ import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
-from mujoco_cases import Interrupted, run
-
-from recipes import mujoco as recipe
+from mujoco_cases import interrupt, run
 
 pytestmark = pytest.mark.usefixtures("without_torchrls_groups")
 
@@ -20,24 +18,10 @@ def teacher(tmp_path_factory):
     return run(tmp_path_factory.mktemp("teacher"), "total_frames=64") / "policy.safetensors"
 
 
-def interrupt(out, frames, monkeypatch, *options):
-    log = recipe.Run.log
-
-    def stopping(self, at, *args):
-        log(self, at, *args)
-        if at == frames:
-            raise Interrupted
-
-    with monkeypatch.context() as patch:
-        patch.setattr(recipe.Run, "log", stopping)
-        with pytest.raises(Interrupted):
-            run(out, *options)
-
-
 def test_tensorboard_has_every_point_once_although_the_run_was_interrupted(teacher, tmp_path, monkeypatch):
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     options = ["logger=tensorboard", "method=ae2r", f"prior.path={teacher}", "checkpoint.interval=128"]
-    interrupt(tmp_path, 192, monkeypatch, *options)  # after the checkpoint at 128: 192 is logged twice
+    interrupt(monkeypatch, tmp_path, 192, *options)  # after the checkpoint at 128: 192 is logged twice
     run(tmp_path, *options)
     found = events.EventAccumulator(str(tmp_path / "log"), size_guidance={"scalars": 0, "histograms": 0}).Reload()
     for prefix, table in (("train", "metrics"), ("eval", "eval")):
@@ -53,7 +37,7 @@ def test_wandb_offline_continues_the_same_run(tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    interrupt(tmp_path, 192, monkeypatch, "logger=wandb")
+    interrupt(monkeypatch, tmp_path, 192, "logger=wandb")
     run(tmp_path, "logger=wandb")
     logs = list((tmp_path / "log").glob("wandb/offline-run-*/run-*.wandb"))
     assert len(logs) >= 1
