@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Iterator
 
 import pytest
 import torch
 from hypothesis import settings
+
+with contextlib.suppress(ImportError):
+    # absl (TensorBoard's and rliable's) remembers the sys.stderr of its import, which here is pytest's, and closes it
+    # when Hydra sets up logging while a test captures: give it one that nobody closes.
+    from absl.logging import get_absl_handler
+
+    get_absl_handler().python_handler.stream = sys.__stderr__
 
 # pytest-xdist runs one process a core: more threads would only get in each other's way.
 torch.set_num_threads(1)

@@ -139,17 +139,8 @@ def test_any_method_can_be_annealed_bonus_and_loss_alike(teacher, tmp_path):
 
 def test_an_annealed_run_goes_on_at_the_coefficient_it_stopped_at(teacher, tmp_path, monkeypatch):
     options = ("method=e2r", f"prior.path={teacher}", "schedule.methods=all", "schedule.shape=cosine")
-    whole, log = run(tmp_path / "whole", *options), recipe.Run.log
-
-    def stopping(self, frames, *args):
-        log(self, frames, *args)
-        if frames == 192:
-            raise Interrupted
-
-    with monkeypatch.context() as patch:
-        patch.setattr(recipe.Run, "log", stopping)
-        with pytest.raises(Interrupted):
-            run(tmp_path / "stopped", *options)
+    whole = run(tmp_path / "whole", *options)
+    interrupt(monkeypatch, tmp_path / "stopped", 192, *options)
     run(tmp_path / "stopped", *options)
     names = ["eval.csv", "policy.safetensors"]
     assert [(tmp_path / "stopped" / n).read_bytes() for n in names] == [(whole / n).read_bytes() for n in names]
