@@ -159,6 +159,13 @@ class TestTable:
         weight.reset_parameters_recursive()
         assert (logits == 0).all()
 
+    @pytest.mark.parametrize("state", [-1, 4])
+    @pytest.mark.parametrize("worlds", [(), (1,)])
+    def test_a_state_that_is_not_in_the_table_is_an_error(self, state: int, worlds: tuple[int, ...]) -> None:
+        weight = PriorWeight.table(4, batch=worlds)
+        with pytest.raises(IndexError):
+            weight(TensorDict(state=torch.full((*worlds, 3), state), batch_size=[*worlds, 3]))
+
     def test_needs_a_state(self) -> None:
         with pytest.raises(ValueError, match="at least one state"):
             PriorWeight.table(0)

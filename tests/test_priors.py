@@ -397,11 +397,12 @@ class TestUniformPrior:
         log_prob = UniformPrior(actions).log_prob(TensorDict(action=action, batch_size=[2]))
         torch.testing.assert_close(log_prob, -torch.log(torch.tensor([4.0, 4.0])))
 
-    def test_bounds_belong_to_the_box(self) -> None:
+    def test_actions_that_the_environment_clips_score_as_their_bounds(self) -> None:
         prior = UniformPrior(Bounded(torch.tensor([0.0, 0.0]), torch.tensor([2.0, 1.0])))
-        inside = TensorDict(action=torch.tensor([[0.0, 1.0], [2.0, 0.5]]), batch_size=[2])
-        torch.testing.assert_close(prior.log_prob(inside), -torch.log(torch.tensor([2.0, 2.0])))
-        assert prior.log_prob(TensorDict(action=torch.tensor([[2.1, 0.5]]), batch_size=[1])).item() == -torch.inf
+        batch = TensorDict(action=torch.tensor([[0.0, 1.0], [2.0, 0.5], [2.1, -9.0]]), batch_size=[3])
+        torch.testing.assert_close(prior.log_prob(batch), torch.full((3,), 2.0).log().neg())
+        student = d.Independent(d.Normal(torch.zeros(3, 2), torch.full((3, 2), 5.0)), 1)
+        torch.testing.assert_close(cross_entropy(student, prior.get_dist(batch)), torch.full((3,), 2.0).log())
 
     @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
     def test_actions_of_any_shape(self, shape: tuple[int, ...]) -> None:

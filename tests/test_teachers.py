@@ -90,6 +90,19 @@ class TestModulePrior:
         ):
             torch.testing.assert_close(prior.log_prob(batch.set("action", taken)), expected)
 
+    @pytest.mark.parametrize("shape", [(), (6,), (2, 3), (1, 2, 3)])
+    def test_a_network_written_for_one_batch_dimension_advises_on_any(self, shape: tuple[int, ...]) -> None:
+        class Images(nn.Sequential):
+            def forward(self, x: torch.Tensor) -> torch.Tensor:
+                assert x.ndim == 4
+                return super().forward(x)
+
+        prior = ModulePrior(Images(nn.Conv2d(1, 2, 3), nn.Flatten(), nn.Softmax(dim=1)), "probs")
+        flat = torch.randn(torch.Size(shape).numel(), 1, 5, 5)
+        expected = prior.get_dist(TensorDict(observation=flat, batch_size=flat.shape[:1])).logits
+        found = prior.get_dist(TensorDict(observation=flat.reshape(*shape, 1, 5, 5), batch_size=shape)).logits
+        torch.testing.assert_close(found, expected.reshape(*shape, 18))
+
     def test_it_is_frozen_and_a_copy(self) -> None:
         net, batch = nn.Linear(OBS, ACTIONS), observations(5)
         prior = ModulePrior(net, "logits")
@@ -127,6 +140,16 @@ class TestModulePrior:
 
 
 class TestCallablePrior:
+    def test_a_bot_that_changes_its_observations_leaves_the_batch_alone(self) -> None:
+        def bot(observation: np.ndarray) -> int:
+            observation *= 0
+            return 1
+
+        batch = observations(6)
+        before = batch["observation"].clone()
+        CallablePrior(bot, num_actions=ACTIONS, epsilon=0.1).get_dist(batch)
+        assert torch.equal(batch["observation"], before)
+
     def test_one_by_one_and_batched_agree(self) -> None:
         batch = observations(2, 3)
         one = CallablePrior(lambda x: np.tanh(x[:2]), std=[0.1, 0.2])

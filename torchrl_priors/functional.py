@@ -21,6 +21,7 @@ __all__ = [
     "gaussian_cross_entropy",
     "gaussian_log_prob_std",
     "has_next_action",
+    "joint",
     "policy_gradient_loss",
     "prior_bonus",
     "prior_weight_loss",
@@ -152,6 +153,24 @@ def has_next_action(done: Tensor, traj_ids: Tensor | None = None, *, time_dim: i
     if traj_ids is not None:
         same = same & (traj_ids.narrow(time_dim, 0, length - 1) == traj_ids.narrow(time_dim, 1, length - 1))
     return torch.cat([same, last], time_dim)
+
+
+def joint(value: Tensor, ndim: int) -> Tensor:
+    r"""The value of a step from those of its independent actions, :math:`\log\pi_0(a|s) = \sum_i\log\pi_0(a_i|s)`.
+
+    Args:
+        value (Tensor): log-probabilities, entropies or cross-entropies, ``[*B]`` or ``[*B, *A]``.
+        ndim (int): number of dimensions of ``*B``.
+
+    Returns:
+        Tensor: ``[*B, 1]``.
+
+    Examples:
+        >>> joint(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), 1)
+        tensor([[3.],
+                [7.]])
+    """
+    return value.flatten(ndim).sum(-1, keepdim=True) if value.ndim > ndim else value.unsqueeze(-1)
 
 
 def shift_to_next(

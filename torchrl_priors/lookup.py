@@ -104,4 +104,6 @@ class StateTable(TensorDictModuleBase):
                 # it would silently read another world's entry
                 raise IndexError(f"States under {self.in_keys[0]!r} must be in [0, {num_states}).")
             state = state + world * num_states
+        else:
+            state = torch.where(state < 0, num_states, state)  # -1 is an error too, not the last state
         return flat[state]

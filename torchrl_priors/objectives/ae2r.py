@@ -21,11 +21,11 @@ from torch import distributions as d
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_priors.functional import alignment, prior_bonus, prior_weight_loss, td_residual
+from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
 from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.priors import ActionPrior
 
-from .cross_entropy import cross_entropy, cross_entropy_and_kl
+from .cross_entropy import cross_entropy_and_kl, cross_entropy_of_advice
 
 __all__ = ["AE2RLoss"]
 
@@ -91,7 +91,8 @@ class AE2RLoss(LossModule):
         prior_in_batch (bool): read the parameters of the prior's distribution from the batch instead of running the
             prior, where ``PriorLogProb(prior, ..., keep_params=True)`` left them: once a rollout, not once a minibatch.
             It needs an :class:`~torchrl_priors.ActionPrior`. Defaults to ``False``.
-        functional (bool): whether the networks are functionalised, as in TorchRL's losses. Defaults to ``True``.
+        functional (bool): whether the networks are functionalised, as in TorchRL's losses; without it they can't share
+            layers with the student. Defaults to ``True``.
 
     The batch must hold ``prior_log_prob`` or ``("next", "prior_log_prob")``, ``[*B, 1]``, as
     :class:`~torchrl_priors.PriorLogProb` writes them (``prior_center`` too if centred), ``("next", "reward")`` and
@@ -103,6 +104,7 @@ class AE2RLoss(LossModule):
 
     Raises:
         ValueError: an unknown option, or one that lacks the network it needs.
+        TypeError: a prior without ``get_dist``.
         KeyError: at call, the batch lacks an entry.
 
     Examples:
@@ -206,6 +208,8 @@ class AE2RLoss(LossModule):
         _check_option("weight_target", weight_target, ("td", "advantage", "none"))
         _check_option("centering", centering, ("none", "prior", "policy"))
         _check_option("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
+        if not hasattr(prior, "get_dist"):
+            raise TypeError(f"The prior must be an ActionPrior or a policy, got {type(prior).__name__}.")
         if prior_in_batch and not isinstance(prior, ActionPrior):
             raise ValueError(f"prior_in_batch=True needs an ActionPrior as prior, got {type(prior).__name__}.")
         if not 0.0 <= gamma <= 1.0:
@@ -248,6 +252,13 @@ class AE2RLoss(LossModule):
         self.prior = prior
         self.prior_in_batch = prior_in_batch
         student = list(actor_network.parameters())
+        trained = {"prior_weight": prior_weight, "critic_network": critic_network if td_error == "original" else None}
+        for name, network in trained.items() if spec.adaptive and not functional else ():
+            if network is not None and not set(student).isdisjoint(network.parameters()):
+                raise ValueError(
+                    f"functional=False, and {name} shares parameters with actor_network: its loss would train the"
+                    " student. Use functional=True, which detaches them, or networks of their own."
+                )
         self._set_network("prior_weight", prior_weight if spec.adaptive else None, apart_from=student)
         self._set_network("critic_network", critic_network if spec.adaptive else None, apart_from=student)
         self._has_critic = spec.adaptive and critic_network is not None
@@ -269,7 +280,8 @@ class AE2RLoss(LossModule):
             self.set_keys(value=_out_key(critic_network, self.tensor_keys.value))
 
     def _set_network(self, name: str, network: TensorDictModule | None, apart_from: list[Tensor] | None = None) -> None:
-        if network is not None and self._functional:
+        # one without parameters is used as it is: what it learns, in buffers, must reach it also after a move
+        if network is not None and self._functional and any(True for _ in network.parameters()):
             # layers shared with the student are the student's to train: `apart_from` enters detached
             self.convert_to_functional(network, name, compare_against=apart_from)
         else:
@@ -393,8 +405,11 @@ class AE2RLoss(LossModule):
                     dist = self.actor_network.get_dist(tensordict.copy())
             entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=self.num_samples)
             teacher = self.spec.cross_entropy == "teacher"
-            auxiliary = cross_entropy(prior_dist, dist, num_samples=self.num_samples) if teacher else entropy
-        return entropy.unsqueeze(-1), auxiliary.unsqueeze(-1), kl.unsqueeze(-1)
+            auxiliary = entropy
+            if teacher:
+                auxiliary = cross_entropy_of_advice(prior_dist, dist, num_samples=self.num_samples)
+        ndim = tensordict.ndim or entropy.ndim  # what dispatch makes has no batch size
+        return joint(entropy, ndim), joint(auxiliary, ndim), joint(kl, ndim)
 
     def _prior_dist(self, tensordict: TensorDictBase) -> d.Distribution:
         if not self.prior_in_batch:
@@ -446,6 +461,8 @@ class AE2RLoss(LossModule):
         log_prob = self._get(tensordict, where(names.prior_log_prob))
         center = 0.0 if self.centering == "none" else self._get(tensordict, where(names.prior_center))
         signal = prior_bonus(self.bonus_coeff, log_prob, center)
+        if shifted:  # what follows an end may be no observation (NaN where environments reset themselves)
+            at = _where(~self._get(tensordict, _next(names.terminated)), at.select(*self.prior_weight.in_keys))
         weight = self._evaluate("prior_weight", at, names.prior_weight)
         if shifted:
             signal = torch.where(self._get(tensordict, _next(names.terminated)), torch.zeros_like(signal), signal)
@@ -464,7 +481,7 @@ class AE2RLoss(LossModule):
         return value
 
     def _params_of(self, name: str) -> contextlib.AbstractContextManager:
-        if not self.functional:
+        if getattr(self, f"{name}_params") is None:
             return contextlib.nullcontext()
         return getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
 
@@ -490,6 +507,14 @@ def _root(key: NestedKey) -> NestedKey:
 
 def _next(key: NestedKey) -> NestedKey:
     return ("next", key) if isinstance(key, str) else ("next", *key)
+
+
+def _where(mask: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
+    """The entries where ``mask`` ``[*B, 1]`` is true, and 0 elsewhere."""
+    mask = mask.squeeze(-1)
+    return tensordict.apply(
+        lambda value: torch.where(mask[(...,) + (None,) * (value.ndim - mask.ndim)], value, torch.zeros_like(value))
+    )
 
 
 def _weight_regression(target: Tensor, weight: Tensor, signal: Tensor) -> Tensor:

@@ -151,7 +151,11 @@ class AVECMixin:
                     " nn.Sequential(..., ValueOffset())."
                 )
             offset = offsets[0].offset
-        return offset.add_(self._mean_error(tensordict)).clone()
+        offset.add_(self._mean_error(tensordict))
+        for module in self.critic_network.modules():  # what value estimators run: a move of the loss parts the two
+            if isinstance(module, ValueOffset):
+                module.offset = offset
+        return offset.clone()
 
     @torch.no_grad()
     def _mean_error(self: Any, tensordict: TensorDictBase) -> Tensor:

@@ -121,11 +121,13 @@ class CompiledStep:
         keys = tuple(sorted(batch.keys(True, True), key=str))  # one graph whatever their order, also on disk
         rates = [torch.tensor(group["lr"], dtype=torch.float32) for group in self.optimizer.param_groups]
         tensors = [*self._state(), *rates, *(batch.get(key) for key in keys)]
+        frozen = tuple(p.requires_grad for group in self.optimizer.param_groups for p in group["params"])
         reports = []
         for index in indices:
-            graph = self._graphs.get((keys, len(index)))
+            which = (keys, len(index), frozen)
+            graph = self._graphs.get(which)
             if graph is None:
-                graph = self._graphs[keys, len(index)] = self._record(keys, tensors, index)
+                graph = self._graphs[which] = self._record(keys, tensors, index)
             reports.append(graph(*tensors, index))
         return torch.stack(reports)
 
@@ -145,7 +147,12 @@ class CompiledStep:
 
     @property
     def _trained(self) -> list[Tensor]:
-        return [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        return [parameter for group in self._groups for parameter in group]
+
+    @property
+    def _groups(self) -> list[list[Tensor]]:
+        """The parameters of each group of the optimizer that are not frozen."""
+        return [[p for p in group["params"] if p.requires_grad] for group in self.optimizer.param_groups]
 
     def _others(self) -> list[Tensor]:
         trained = set(map(id, self._trained))
@@ -177,7 +184,7 @@ class CompiledStep:
 
             end = 0
             for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-                start, end = end, end + len(group["params"])
+                start, end = end, end + sum(parameter.requires_grad for parameter in group["params"])
                 reached = [i for i in range(start, end) if gradients[i] is not None]
                 clipped = _clip([gradients[i] for i in reached], self.max_grad_norm)
                 for i, gradient in zip(reached, clipped, strict=True):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeGuard
+
 import torch
 from torch import Tensor
 from torch import distributions as d
+from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import has_analytic_entropy, has_analytic_kl, rsample_and_log_prob
 
 from torchrl_priors.functional import categorical_cross_entropy, gaussian_cross_entropy
+from torchrl_priors.priors.uniform import BoxUniform
 
 __all__ = ["cross_entropy", "has_analytic_cross_entropy", "kl_divergence"]
 
@@ -22,8 +26,9 @@ def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
     parameters of both distributions.
 
     * Closed form between categorical families (torch's and TorchRL's, indices or one-hot, masked or not), between
-      diagonal Gaussians, and for every pair with a registered :math:`\mathrm{KL}(\pi\|\pi_0)` and an analytic entropy,
-      since :math:`H^X = \mathrm{KL} + H(\pi)`. ``num_samples`` is not used then.
+      diagonal Gaussians, from a mixture of them to one, to a :class:`~torchrl_priors.UniformPrior`, and for every pair
+      with a registered :math:`\mathrm{KL}(\pi\|\pi_0)` and an analytic entropy, since
+      :math:`H^X = \mathrm{KL} + H(\pi)`. ``num_samples`` is not used then.
     * Monte-Carlo over reparameterised samples elsewhere (e.g. :class:`~torchrl.modules.TanhNormal`). Where the KL is
       known and only the entropy is not, only the entropy is sampled: the gradient that pulls towards the prior is then
       exact, and no sample near the bounds of a squashed action needs to be inverted.
@@ -41,7 +46,8 @@ def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
         Tensor: nats, ``[*B]``.
 
     Raises:
-        ValueError: the two distributions are over actions of different shapes, or ``num_samples`` < 1.
+        ValueError: the two distributions are over actions of different shapes, the student's are unbounded and the
+            prior's bounded, or ``num_samples`` < 1.
         NotImplementedError: there is no closed form, and the student can't be sampled with a gradient.
 
     Examples:
@@ -82,6 +88,8 @@ def has_analytic_cross_entropy(dist: d.Distribution, prior_dist: d.Distribution)
     """
     if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
         return True
+    if isinstance(prior_dist, BoxUniform) or (_is_mixture(dist) and _is_gaussian(prior_dist)):
+        return True
     return has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist)
 
 
@@ -106,6 +114,17 @@ def kl_divergence(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
     return (log_prob - prior_dist.log_prob(action)).mean(0)
 
 
+def cross_entropy_of_advice(
+    prior_dist: d.Distribution, dist: d.Distribution, *, num_samples: int | None = None
+) -> Tensor:
+    r"""The other direction, :math:`H^X(\pi_0\|\pi)`; actions that the student can't take (masked) cost nothing."""
+    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
+        _check_same_actions(dist, prior_dist)
+        log_probs = dist.logits.masked_fill(dist.logits.isneginf(), 0.0)
+        return categorical_cross_entropy(prior_dist.logits, log_probs)
+    return cross_entropy(prior_dist, dist, num_samples=num_samples)
+
+
 def cross_entropy_and_kl(
     dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -123,14 +142,21 @@ def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | N
         log_probs, prior_log_probs = dist.logits, prior_dist.logits
         # an action that the student can't take costs nothing, even where the prior forbids it too: 0 log 0 = 0
         return categorical_cross_entropy(log_probs, prior_log_probs.masked_fill(log_probs.isneginf(), 0.0))
+    if isinstance(prior_dist, BoxUniform):
+        return -prior_dist.log_density.expand(torch.broadcast_shapes(dist.batch_shape, prior_dist.batch_shape))
     if isinstance(dist, d.Independent) and isinstance(prior_dist, d.Independent):
         ndims = dist.reinterpreted_batch_ndims
         if ndims == prior_dist.reinterpreted_batch_ndims:
             base, prior_base = dist.base_dist, prior_dist.base_dist
-            if ndims == 1 and isinstance(base, d.Normal) and isinstance(prior_base, d.Normal):
+            if _is_gaussian(dist) and _is_gaussian(prior_dist):
                 return gaussian_cross_entropy(base.loc, base.scale, prior_base.loc, prior_base.scale)
             terms = _closed_form(base, prior_base)
             return terms if terms is None or ndims == 0 else terms.flatten(-ndims).sum(-1)
+    if _is_mixture(dist) and _is_gaussian(prior_dist):  # an expectation is linear in the mixture
+        component: Any = dist.component_distribution
+        base, prior_base = component.base_dist, prior_dist.base_dist
+        loc, scale = prior_base.loc.unsqueeze(-2), prior_base.scale.unsqueeze(-2)
+        return (dist.mixture_distribution.probs * gaussian_cross_entropy(base.loc, base.scale, loc, scale)).sum(-1)
     if isinstance(dist, d.Normal) and isinstance(prior_dist, d.Normal):
         return gaussian_cross_entropy(
             dist.loc.unsqueeze(-1),
@@ -143,7 +169,30 @@ def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | N
     return None
 
 
+def _is_gaussian(dist: d.Distribution) -> TypeGuard[d.Independent]:
+    return isinstance(dist, d.Independent) and (
+        dist.reinterpreted_batch_ndims == 1 and isinstance(dist.base_dist, d.Normal)
+    )
+
+
+def _is_mixture(dist: d.Distribution) -> TypeGuard[d.MixtureSameFamily]:
+    return isinstance(dist, d.MixtureSameFamily) and _is_gaussian(dist.component_distribution)
+
+
+def _base(dist: d.Distribution) -> d.Distribution:
+    while isinstance(dist, d.Independent):
+        dist = dist.base_dist
+    return dist
+
+
 def _check_same_actions(dist: d.Distribution, prior_dist: d.Distribution) -> None:
+    student, teacher = _base(dist), _base(prior_dist)
+    if isinstance(student, d.Normal) and isinstance(teacher, TanhNormal):
+        raise ValueError(
+            f"The student's {type(student).__name__} is unbounded, and the prior's {type(teacher).__name__} has no"
+            " finite opinion outside of its bounds: give the student bounded actions (TanhNormal), or make the prior a"
+            " Gaussian, as std=... does in load_sb3_prior."
+        )
     if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
         shape, prior_shape = dist.logits.shape[-1:], prior_dist.logits.shape[-1:]
     else:

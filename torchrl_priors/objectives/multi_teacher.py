@@ -44,7 +44,8 @@ class MultiTeacherLoss(LossModule):
     The batch must hold what :func:`~torchrl_priors.multi_teacher_transforms` writes. ``set_keys`` renames ``reward``,
     ``terminated``, ``value`` and ``raw_advantage`` for all teachers. The output is that of :class:`AE2RLoss`, its names
     followed by the teacher's: ``"loss_prior_expert"``, ``"loss_prior_weight_expert"``, ``"prior_weight_expert"``, ...;
-    and, once, ``"loss_prior_critic"`` and ``"prior_td_error"``.
+    and, once, ``"loss_prior_critic"`` and ``"prior_td_error"``. Coefficients are those of the :class:`AE2RLoss` of each
+    teacher, in ``losses``: ``loss.losses[0].aux_coeff = 0.5``.
 
     Raises:
         ValueError: two teachers share a namespace, there is not one weight for each, or as in :class:`AE2RLoss`.
@@ -80,7 +81,7 @@ class MultiTeacherLoss(LossModule):
         weights = check_namespaces(priors, prior_weights, adaptive=spec.adaptive)
         super().__init__()
         self.spec = spec
-        self.names = ["_".join(name) if isinstance(name := prior.namespace, tuple) else name for prior in priors]
+        self.names = [_flat(prior.namespace) for prior in priors]
         losses: list[AE2RLoss] = []
         for prior, weight in zip(priors, weights, strict=True):
             loss = AE2RLoss(actor_network, prior, weight, critic_network, method=spec, **kwargs)
@@ -93,6 +94,7 @@ class MultiTeacherLoss(LossModule):
                 loss.critic_network_params = losses[0].critic_network_params
             losses.append(loss)
         self.losses = torch.nn.ModuleList(losses)
+        self.reduction = losses[0].reduction
 
     def _by_name(self) -> list[tuple[str, Any]]:
         return list(zip(self.names, self.losses, strict=True))
@@ -133,6 +135,7 @@ class MultiTeacherLoss(LossModule):
         """The losses of a batch, and what is worth logging; the batch is left as it is."""
         out: dict[str, Any] = {}
         for name, loss in self._by_name():
+            loss.loss_mask_key, loss.reduction = self.loss_mask_key, self.reduction
             for key, value in loss(tensordict).items():
                 out.setdefault(self._name(key, name), value)
         return TensorDict(out)
@@ -143,12 +146,16 @@ class MultiTeacherLoss(LossModule):
             loss.reset_parameters_recursive()
 
 
+def _flat(namespace: NestedKey) -> str:
+    return "_".join(namespace) if isinstance(namespace, tuple) else namespace
+
+
 def check_namespaces(
     priors: Sequence[ActionPrior], prior_weights: Sequence[PriorWeight] | None, *, adaptive: bool
 ) -> list[PriorWeight | None]:
     """The weight of each teacher, ``None`` for methods without; refuses teachers that would share entries."""
     names = [prior.namespace for prior in priors]
-    if not names or len(set(names)) < len(names):
+    if not names or len(set(map(_flat, names))) < len(names):
         raise ValueError(f"Each of several teachers needs a namespace of its own, got {names}.")
     if not adaptive:
         return [None] * len(names)

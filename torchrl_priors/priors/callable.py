@@ -107,7 +107,7 @@ class _Controller(TensorDictModuleBase):
         """The policy's actions ``[*B, ...]``, on the device of the observations."""
         batch = tensordict.batch_size
         tensors = [tensordict.get(key) for key in self.in_keys]
-        arrays = [value.detach().cpu().reshape(-1, *value.shape[len(batch) :]).numpy() for value in tensors]
+        arrays = [value.detach().cpu().reshape(-1, *value.shape[len(batch) :]).numpy().copy() for value in tensors]
         if self.batched:
             actions = np.asarray(self.policy(*arrays))
         else:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from torch import Tensor, nn
+from torch.compiler import is_compiling
 
 __all__ = ["GaussianHead", "NatureCNN", "ScaleToBox", "StateIndependentStd", "TeacherInput"]
 
@@ -67,6 +68,9 @@ class TeacherInput(nn.Module):
                 f"The teacher reads raw observations of shape [*B, {', '.join(map(str, self.shape))}], got"
                 f" {tuple(observation.shape)}."
             )
+        floats = self.pixels and observation.is_floating_point() and observation.numel() > 0
+        if floats and not is_compiling() and 0 < observation.max() <= 1:
+            raise ValueError("The teacher reads raw pixels from 0 to 255, got floats up to 1, as of ToTensorImage.")
         if self.mean is not None and self.var is not None:
             observation = (observation.to(self.mean) - self.mean) / (self.var + self.eps).sqrt()
             observation = observation.clamp(-self.clip, self.clip)

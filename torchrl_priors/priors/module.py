@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
@@ -30,13 +30,14 @@ class ModulePrior(ActionPrior):
     Like any :class:`ActionPrior` it copies the network, freezes it and keeps it in evaluation mode.
 
     Args:
-        module (nn.Module): from the entries ``in_keys``, ``[*B, ...]``, to ``output``.
+        module (nn.Module): from the entries ``in_keys`` to ``output``. It gets and returns ``[N, ...]``: the batch is
+            flattened, so that a network of images or one with ``softmax(dim=1)`` works whatever ``*B`` is.
         output (str): what it returns:
 
-            * ``"logits"``: unnormalised log-probabilities of discrete actions ``[*B, A]``;
-            * ``"probs"``: their probabilities ``[*B, A]``;
-            * ``"mean"``: a deterministic action ``[*B, A]``, which needs a ``std``;
-            * ``"mean_std"``: a pair of mean and standard deviation, each ``[*B, A]``;
+            * ``"logits"``: unnormalised log-probabilities of discrete actions ``[N, A]``;
+            * ``"probs"``: their probabilities ``[N, A]``, all above 0 (:class:`AffordancePrior` takes zeros);
+            * ``"mean"``: a deterministic action ``[N, A]``, which needs a ``std``;
+            * ``"mean_std"``: a pair of mean and standard deviation, each ``[N, A]``;
             * ``"distribution"``: a :class:`torch.distributions.Distribution`, categorical or a (diagonal) Gaussian,
               which needs ``distribution_class`` to say which of the two.
 
@@ -94,7 +95,7 @@ class ModulePrior(ActionPrior):
         names = ["logits"] if discrete else ["loc", "scale"]
         super().__init__(
             ProbabilisticTensorDictSequential(
-                TensorDictModule(
+                _Flat(
                     _Params(module, output, std, discrete),
                     in_keys=["observation"] if in_keys is None else list(in_keys),
                     out_keys=names,
@@ -109,6 +110,18 @@ class ModulePrior(ActionPrior):
             namespace=namespace,
         )
         self.output = output
+
+
+class _Flat(TensorDictModule):
+    """Gives a network ``[N, ...]``, which is what it was written for, whatever the batch is."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if tensordict.ndim == 1:
+            return super().forward(tensordict)
+        flat = super().forward(tensordict.select(*self.in_keys).reshape(-1))
+        for key in self.out_keys:
+            tensordict.set(key, flat.get(key).reshape(*tensordict.batch_size, *flat.get(key).shape[1:]))
+        return tensordict
 
 
 class _Params(nn.Module):

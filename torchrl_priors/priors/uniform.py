@@ -14,14 +14,14 @@ from torchrl.modules import OneHotCategorical
 
 from torchrl_priors.priors.action_prior import ActionPrior
 
-__all__ = ["UniformPrior"]
+__all__ = ["BoxUniform", "UniformPrior"]
 
 
 class UniformPrior(ActionPrior):
     r"""The prior that knows nothing: all actions are equally probable.
 
-    Over discrete actions, rewarding its (constant) log-probability changes nothing, and the cross-entropy to it is
-    constant: useful as a control, and as the adversary of a degradation.
+    Its log-probability is constant, and so is the cross-entropy to it: useful as a control, and as the adversary of a
+    degradation. Actions outside of their bounds, which an environment clips, are scored as the bounds are.
 
     Args:
         actions (TensorSpec or int): the action spec (without batch dimensions of an environment): discrete
@@ -84,17 +84,22 @@ class _Constant(TensorDictModuleBase):
         return tensordict
 
 
-class _BoxUniform(d.Independent):
-    """Uniform over a closed box, so that an action clipped to a bound has a finite log-probability."""
+class BoxUniform(d.Independent):
+    """Uniform over a box; an action outside, which the environment clips, is scored as the bound it is clipped to."""
 
     def __init__(self, low: Tensor, high: Tensor, event_dims: int) -> None:
         super().__init__(d.Uniform(low, high, validate_args=False), event_dims)
 
-    def log_prob(self, value: Tensor) -> Tensor:
-        low, high = self.base_dist.low, self.base_dist.high
-        density = torch.where((low <= value) & (value <= high), -(high - low).log(), -torch.inf)
-        dims = self.reinterpreted_batch_ndims
+    @property
+    def log_density(self) -> Tensor:
+        """Minus the log of the box's volume, ``[*B]``."""
+        density, dims = -(self.base_dist.high - self.base_dist.low).log(), self.reinterpreted_batch_ndims
         return density.flatten(-dims).sum(-1) if dims else density
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """The same for every action."""
+        shape = value.shape[: value.ndim - len(self.event_shape)]
+        return self.log_density.to(value.dtype).expand(torch.broadcast_shapes(shape, self.batch_shape))
 
 
 def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[str, Any]]:
@@ -111,7 +116,7 @@ def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[st
         low, high = actions.space.low, actions.space.high
         if not (low.isfinite().all() and high.isfinite().all()):
             raise ValueError(f"There is no uniform distribution over unbounded actions: {actions}.")
-        return {"low": low.clone(), "high": high.clone()}, _BoxUniform, {"event_dims": low.ndim}
+        return {"low": low.clone(), "high": high.clone()}, BoxUniform, {"event_dims": low.ndim}
     raise TypeError(
         f"Expected a number of actions or a spec of kind Categorical, OneHot or (continuous) Bounded, without the batch"
         f" dimensions of an environment (env.action_spec_unbatched), got {actions}."

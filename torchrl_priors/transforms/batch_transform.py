@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NoReturn
+from copy import deepcopy
+from typing import Any, NoReturn
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
@@ -38,6 +39,15 @@ class BatchTransform(Transform):
     A sampler of slices returns them back to back: reshape the sample to ``[slices, slice_len]`` first, with a transform
     of the buffer or after sampling, lest the end of a slice continue with the beginning of another of its trajectory.
     """
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> BatchTransform:
+        # Asynchronous collectors copy their postproc: networks that belong to others stay theirs, and go on learning.
+        copy = self.__class__.__new__(self.__class__)
+        memo[id(self)] = copy
+        for name, value in self.__dict__.items():
+            other = name in ("actor", "prior_weight")
+            copy.__dict__[name] = memo.get(id(value), value) if other else deepcopy(value, memo)
+        return copy
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Refuses an environment, at whatever depth."""

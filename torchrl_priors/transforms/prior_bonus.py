@@ -96,6 +96,10 @@ class PriorBonus(BatchTransform):
             raise ValueError(
                 f"relative=True needs shift='current' and centering='none', got {shift!r} and {centering!r}."
             )
+        if prior_weight is not None and not hasattr(prior_weight, "out_keys"):
+            raise TypeError(
+                f"The weight must be a PriorWeight, got {type(prior_weight).__name__}: try PriorWeight(net)."
+            )
         out_keys = [("next", "prior_bonus"), ("next", "shaped_reward")] if out_keys is None else out_keys
         if len(out_keys) != 2:
             raise ValueError(f"Expected a key for the bonus and one for the shaped reward, got {out_keys}.")

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives import LossModule
 
-from torchrl_priors.functional import has_next_action, shift_to_next
+from torchrl_priors.functional import has_next_action, joint, shift_to_next
 from torchrl_priors.objectives.cross_entropy import cross_entropy
 from torchrl_priors.priors import ActionPrior
 from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of, under_next
@@ -107,6 +107,8 @@ class PriorLogProb(BatchTransform):
         traj_key: NestedKey = ("collector", "traj_ids"),
         mask_key: NestedKey = ("collector", "mask"),
     ) -> None:
+        if not isinstance(prior, ActionPrior):
+            raise TypeError(f"The prior must be an ActionPrior, got {type(prior).__name__}: try ActionPrior(policy).")
         for name, value, known in (("boundary", boundary, _Boundary), ("centering", centering, _Centering)):
             if value not in get_args(known):
                 raise ValueError(f"Unknown {name} {value!r}: expected one of {', '.join(get_args(known))}.")
@@ -175,6 +177,11 @@ class PriorLogProb(BatchTransform):
             for key, name in zip(self.prior.out_keys, self.prior.param_names, strict=True):
                 tensordict.set(key, params[name])
         values = [self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)]
+        if not torch.compiler.is_compiling() and not values[0].isfinite().all():
+            raise ValueError(
+                "The prior gives a log-probability that is not finite to an action that the student took: smooth it, or"
+                " keep the student's actions within its bounds."
+            )
         if self.centering != "none":
             policy = self._student(tensordict) if self.centering == "policy" else None
             values.append(self._center(dist, policy, tensordict.ndim))
@@ -244,7 +251,7 @@ class PriorLogProb(BatchTransform):
             log_prob = -cross_entropy(policy, prior_dist, num_samples=self.num_samples)
         else:
             log_prob = prior_dist.log_prob(policy.sample())
-        values = [_joint(log_prob, following.ndim)]
+        values = [joint(log_prob, following.ndim)]
         if self.centering != "none":
             values.append(self._center(prior_dist, policy, following.ndim))
         return values
@@ -256,9 +263,4 @@ class PriorLogProb(BatchTransform):
     def _center(self, prior_dist: d.Distribution, policy: d.Distribution | None, ndim: int) -> Tensor:
         """H(pi0) or H^X(pi || pi0), ``[*B, 1]``."""
         of = prior_dist if self.centering == "prior" or policy is None else policy
-        return _joint(cross_entropy(of, prior_dist, num_samples=self.num_samples), ndim)
-
-
-def _joint(value: Tensor, ndim: int) -> Tensor:
-    """The sum over independent actions of a step, from ``[*B]`` or ``[*B, ...]`` to ``[*B, 1]``."""
-    return value.flatten(ndim).sum(-1, keepdim=True) if value.ndim > ndim else value.unsqueeze(-1)
+        return joint(cross_entropy(of, prior_dist, num_samples=self.num_samples), ndim)
