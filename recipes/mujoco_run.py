@@ -21,7 +21,7 @@ from tqdm import tqdm
 from recipes.launchers import fail, in_sweep
 from recipes.loggers import RunLogger
 from recipes.mujoco_config import MujocoConfig
-from recipes.runs import RunFolder, digest
+from recipes.runs import RunFolder, digest, refuse_foreign
 from recipes.schedule_config import without_idle
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors.evaluation import Evaluation
@@ -73,7 +73,8 @@ class Run:
         self.frames = 0
         self.collector = components["collector"]
         self.checkpoint = Checkpoint(**components, rng=GlobalRNGState())
-        if self.cfg.resume and self.rotation.latest() is not None:
+        if self.cfg.resume and (latest := self.rotation.latest()) is not None:
+            refuse_foreign(latest)
             self.rotation.load_latest(self.checkpoint)
             self.frames = self.collector.frames
             self.evaluations = _rows_until(self.folder.path / "eval.csv", self.frames)

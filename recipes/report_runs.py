@@ -106,7 +106,8 @@ def _read(folder: Path) -> Run | LeftOut:
 def _read_whole(folder: Path) -> Run:
     _check_finished(folder)
     try:
-        config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"), resolve=True)
+        # as it is: what another's file has in ${...} could be a secret of this machine, and the report is published
+        config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         method, seed, env = str(config["method"]), int(config["seed"]), _env(config["env"])
         auxiliary = get_method(method).auxiliary
     except FileNotFoundError:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["RunFolder", "digest"]
+__all__ = ["RunFolder", "digest", "refuse_foreign"]
 
 #: Temporary names: of :meth:`RunFolder.write`, of policies, and of TorchRL's checkpoints (being written or removed).
 _LEFTOVERS = (".[0-9]*.*", "*/.[0-9]*.*", ".*.partial", "checkpoints/.checkpoint-*")
@@ -22,6 +22,21 @@ _LEFTOVERS = (".[0-9]*.*", "*/.[0-9]*.*", ".*.partial", "checkpoints/.checkpoint
 def digest(config: dict[str, Any]) -> str:
     """Eight characters that tell two configurations apart."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def refuse_foreign(checkpoint: Path) -> None:
+    """Refuse a checkpoint that is more than folders of JSON and arrays: of other files, tensordict would run a pickle.
+
+    Raises:
+        ValueError: names the file.
+    """
+    for path in (checkpoint, *sorted(checkpoint.rglob("*"))):
+        plain = path.is_dir() or (path != checkpoint and path.is_file() and path.suffix in (".json", ".memmap"))
+        if path.is_symlink() or not plain:
+            raise ValueError(
+                f"{path} is not loaded: a checkpoint is a folder, of folders and files .json and .memmap only. Delete"
+                " it, if it is not yours."
+            )
 
 
 def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:

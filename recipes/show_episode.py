@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
 from recipes.mujoco import Agent
+from recipes.runs import refuse_foreign
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
 from torchrl_priors.collectors import VectorCollector, make_vector_env
 from torchrl_priors.collectors.vector_env import spread_seed
@@ -31,7 +32,8 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
     A checkpoint holds every network and the normaliser as plain tensors: nothing else needs to be exported.
 
     Raises:
-        ValueError: the run has no learned weight or no checkpoint, or the teacher is not that of the run.
+        ValueError: the run has no learned weight or no checkpoint, the teacher is not that of the run, or the
+            environment or the checkpoint could run code.
     """
     cfg: Any = OmegaConf.load(folder / "config.yaml")
     if not get_method(cfg.method).adaptive:
@@ -45,12 +47,15 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
     if sha256(path.read_bytes()).hexdigest() != expected:
         raise ValueError(f"{path} is not the teacher of {folder}: its content is another one.")
     env_id = f"{cfg.env.id}-{cfg.env.version}"
+    if ":" in env_id:  # Gymnasium would import what is before it
+        raise ValueError(f"{folder} is a run of {env_id!r}: an environment that names a module to import is not shown.")
     env = make_vector_env(env_id, 1, **cfg.env.kwargs)
     agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
     env.close()
     rotation = CheckpointRotation(folder / "checkpoints", keep_last=cfg.checkpoint.keep)
-    if rotation.latest() is None:
+    if (latest := rotation.latest()) is None:
         raise ValueError(f"{folder} has no checkpoint.")
+    refuse_foreign(latest)
     rotation.load_latest(Checkpoint(agent=agent), components=["agent"])
     agent.normalizer.freeze()
     return agent, env_id
