@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from torchrl_priors.artifacts.inert_pickle import InertPickleError, StandIn, read_pickle
+from torchrl_priors.artifacts.errors import InertPickleError
+from torchrl_priors.artifacts.inert_pickle import StandIn, read_pickle
+from torchrl_priors.artifacts.pickle_program import check_program
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
@@ -64,3 +66,56 @@ def test_spaces_are_stand_ins() -> None:
 def test_everything_else_is_refused(data: bytes, match: str) -> None:
     with pytest.raises(InertPickleError, match=match):
         read_pickle(data)
+
+
+# Pickles of one array: what comes before its shape, and what after.
+BEFORE = b"\x80\x04cnumpy.core.multiarray\n_reconstruct\n)R(K\x01"
+AFTER = b"cnumpy\ndtype\n(\x8c\x02f8K\x00K\x01tR\x89C\x00tb."
+
+
+def twice(times: int) -> bytes:
+    """A tuple with the one before it twice, and so on."""
+    return b")" + b"".join(b"\x94h" + bytes([number]) + b"\x86" for number in range(times))
+
+
+@pytest.mark.parametrize(
+    ("data", "match"),
+    [
+        (b"\x80\x04})" + b"\x85" * 100_000 + b"K\x01s.", "tuples in tuples"),  # hashing one crashes
+        (b"\x80\x04}(0)" + b"\x85" * 100_000 + b"K\x01s.", "tuples in tuples"),  # after a mark that is taken back
+        (b"\x80\x04}" + twice(60) + b"K\x01s.", "tuples in tuples"),  # hashing one never ends
+        (BEFORE + twice(20) + AFTER, "tuples in tuples"),  # writing it into a message needs 100 MB
+        (b"\x80\x04(" + b"K\x01" * 2000 + b"t.", "tuples in tuples"),
+        (b"\x80\x04]" + b"]a" * 200_000 + b".", "more than 262144 steps"),
+        (BEFORE + b"(" + b"\x8a\xff" + b"\x7f" * 255 + b"t" + AFTER, r"array of shape \(\d+\.\.\."),
+        (BEFORE + b"(" + b"K\x01" * 40 + b"t" + AFTER, r"array of shape \(1, 1, "),
+        (b"\x80\x04]q\xffp1000000\n.", "memo is out of range"),
+    ],
+)
+def test_programs_without_end_are_refused_before_they_run(data: bytes, match: str) -> None:
+    with pytest.raises(InertPickleError, match=match) as caught:
+        read_pickle(data)
+    assert len(str(caught.value)) < 200
+
+
+class View:
+    """Is pickled as an array of bytes that others have too."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def __reduce__(self) -> Any:
+        return np.zeros(1).__reduce_ex__(5)[0], (self.data, np.dtype(np.float64), (len(self.data) // 8,), "C")
+
+
+def test_arrays_of_one_buffer_do_not_fill_the_memory() -> None:
+    data = bytes(8000)
+    assert read_pickle(pickle.dumps(View(data))).shape == (1000,)
+    with pytest.raises(InertPickleError, match="its arrays are larger than it is"):
+        read_pickle(pickle.dumps([View(data)] + [View(data)]))
+
+
+@pytest.mark.parametrize("value", [{(1, (2, 3)): ((), ((),))}, np.arange(3), spaces.Tuple([spaces.Discrete(2)] * 3)])
+def test_what_is_honest_passes(value: Any) -> None:
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        check_program(pickle.dumps([value, value], protocol=protocol))

@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_priors.artifacts.errors import ArtifactError, differing
 from torchrl_priors.networks import ACTIVATIONS
 
 __all__ = [
@@ -45,10 +46,6 @@ _MAX_FILE = 1 << 30  # bytes: a file's bytes are hashed in memory, so what it cl
 _NO_DIGEST = "0" * 64
 STATISTICS = ("mean", "var", "count")
 """The buffers of a :class:`~torchrl_priors.collectors.RunningNorm`; a file has them after ``normalizer.``."""
-
-
-class ArtifactError(ValueError):
-    """A file is not the policy that was asked for: damaged, foreign, too new, or for another environment."""
 
 
 @dataclass(frozen=True)
@@ -312,10 +309,8 @@ def check_tensors(tensors: dict[str, Tensor], manifest: PolicyManifest) -> None:
         for name in STATISTICS:
             expected[f"normalizer.{name}"] = () if name == "count" else (manifest.obs_dim,), torch.float64
     if tensors.keys() != expected.keys():
-        differing = sorted(tensors.keys() ^ expected.keys())
-        shown = ", ".join(name if name.isprintable() else ascii(name) for name in differing[:5])
-        more = f" and {len(differing) - 5} more" if len(differing) > 5 else ""
-        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {shown[:500]}{more}")
+        names = differing(tensors.keys() ^ expected.keys())
+        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {names}")
     for name, (shape, dtype) in expected.items():
         value = tensors[name]
         if tuple(value.shape) != shape or value.dtype is not dtype:

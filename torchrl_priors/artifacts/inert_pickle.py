@@ -9,13 +9,15 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import pickletools
 import re
 from typing import Any
 
 import numpy as np
 
-__all__ = ["InertPickleError", "StandIn", "read_pickle"]
+from torchrl_priors.artifacts.errors import InertPickleError, short
+from torchrl_priors.artifacts.pickle_program import check_program
+
+__all__ = ["MAX_BYTES", "StandIn", "read_pickle"]
 
 _SPACES = r"(gym|gymnasium)\.spaces(\.\w+)?\.(Box|Discrete|MultiDiscrete|MultiBinary|Dict|Tuple|Text)"
 _NUMBERS = r"numpy\.(bool_?|u?int(8|16|32|64)|float(16|32|64))"
@@ -30,11 +32,8 @@ _KNOWN = re.compile(
     r"|stable_baselines3\.common\.running_mean_std\.RunningMeanStd"
     r"|stable_baselines3\.common\.vec_env\.vec_normalize\.VecNormalize"
 )
-_MAX_BYTES = 1 << 28
-
-
-class InertPickleError(ValueError):
-    """A pickle is damaged, or names something else than the numbers, spaces and statistics that are expected."""
+MAX_BYTES = 1 << 25
+"""The longest pickle that is read; statistics of large images have a million."""
 
 
 class StandIn:
@@ -60,7 +59,7 @@ class StandIn:
         self.state = state if isinstance(state, dict) else {"state": state}
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        self.state[str(key)] = value
+        self.state[key if isinstance(key, str) else short(key)] = value
 
 
 class _DType(StandIn):
@@ -72,7 +71,7 @@ class _DType(StandIn):
             code = code.pickled_name.removeprefix("numpy.")
         order: Any = (self.state.get("state") or (0, "|"))[1]
         if not isinstance(code, str) or not _NUMBER.fullmatch(code) or order not in ("<", ">", "|", "="):
-            raise InertPickleError(f"it has an array of type {code!r}, numbers were expected")
+            raise InertPickleError(f"it has an array of type {short(code)}, numbers were expected")
         return np.dtype(code).newbyteorder(order)
 
 
@@ -130,8 +129,12 @@ def _array(data: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray[Any, Any
     kind = dtype.resolve() if isinstance(dtype, _DType) else None
     if kind is None or not isinstance(data, (bytes, bytearray)) or order not in ("C", "F"):
         raise InertPickleError("it has an array that is not one of numbers")
-    if not isinstance(shape, tuple) or not all(type(size) is int and size >= 0 for size in shape):
-        raise InertPickleError(f"it has an array of shape {shape!r}")
+    if (
+        not isinstance(shape, tuple)
+        or len(shape) > 32
+        or not all(type(size) is int and 0 <= size < 1 << 31 for size in shape)
+    ):
+        raise InertPickleError(f"it has an array of shape {short(shape)}")
     if math.prod(shape) * kind.itemsize != len(data):
         raise InertPickleError(f"it has an array of shape {shape} and type {kind} with {len(data)} bytes")
     native = np.frombuffer(bytes(data), dtype=kind).astype(kind.newbyteorder("="))
@@ -171,41 +174,51 @@ def read_pickle(data: bytes) -> Any:
         >>> read_pickle(pickle.dumps(print))
         Traceback (most recent call last):
         ...
-        torchrl_priors.artifacts.inert_pickle.InertPickleError: it names builtins.print, which is none of the arrays,
+        torchrl_priors.artifacts.errors.InertPickleError: it names builtins.print, which is none of the arrays,
         spaces and statistics that are expected; nothing in it was run
     """
-    if len(data) > _MAX_BYTES:
-        raise InertPickleError(f"it is longer than {_MAX_BYTES} bytes")
+    if len(data) > MAX_BYTES:
+        raise InertPickleError(f"it is longer than {MAX_BYTES} bytes")
     try:
-        # a memo index is the length of a list that the unpickler makes: no honest pickle skips any
-        for opcode, argument, _ in pickletools.genops(data):
-            if opcode.name.endswith("PUT") and isinstance(argument, int) and not 0 <= argument <= len(data):
-                raise InertPickleError("it is damaged: its memo is out of range")
-        value = _Unpickler(io.BytesIO(data)).load()
-        return _resolve(value, {})
+        check_program(data)
+        return _Resolver(len(data)).resolve(_Unpickler(io.BytesIO(data)).load())
     except InertPickleError:
         raise
-    except (Exception, RecursionError) as error:  # a damaged program can fail in any way
+    except Exception as error:  # a damaged program can fail in any way
         raise InertPickleError(f"it is no pickle that can be read: {type(error).__name__}: {error}") from None
 
 
-def _resolve(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
-    """The same with arrays in place of their stand-ins, at any depth."""
-    if id(value) in seen:
-        return seen[id(value)][1]
-    # the original is kept beside its result, lest another object gets its id
-    if isinstance(value, (_Array, _FromBuffer, _Scalar, _Encode)):
-        seen[id(value)] = value, value.resolve()
-        return seen[id(value)][1]
-    seen[id(value)] = value, value
-    if isinstance(value, dict):
-        value.update({key: _resolve(item, seen) for key, item in value.items()})
-    elif isinstance(value, list):
-        value[:] = [_resolve(item, seen) for item in value]
-    elif isinstance(value, tuple):
-        result = tuple(_resolve(item, seen) for item in value)
-        seen[id(value)] = value, result
-        return result
-    elif isinstance(value, StandIn):
-        value.state = {key: _resolve(item, seen) for key, item in value.state.items()}
-    return value
+class _Resolver:
+    """Puts arrays in place of their stand-ins, at any depth.
+
+    Args:
+        room (int): bytes that the arrays may have in all: those of the pickle. Each array of an honest one has its own.
+    """
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        # the original is kept beside its result, lest another object gets its id
+        self.seen: dict[int, tuple[Any, Any]] = {}
+
+    def resolve(self, value: Any) -> Any:
+        if id(value) in self.seen:
+            return self.seen[id(value)][1]
+        self.seen[id(value)] = value, value
+        if isinstance(value, (_Array, _FromBuffer, _Scalar, _Encode)):
+            result = value.resolve()
+            self.room -= len(result) if isinstance(result, bytes) else getattr(result, "nbytes", 0)
+            if self.room < 0:
+                raise InertPickleError("its arrays are larger than it is")
+            self.seen[id(value)] = value, result
+            return result
+        if isinstance(value, dict):
+            value.update({key: self.resolve(item) for key, item in value.items()})
+        elif isinstance(value, list):
+            value[:] = map(self.resolve, value)
+        elif isinstance(value, tuple):
+            result = tuple(map(self.resolve, value))
+            self.seen[id(value)] = value, result
+            return result
+        elif isinstance(value, StandIn):
+            value.state = {key: self.resolve(item) for key, item in value.state.items()}
+        return value

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_priors.artifacts.format import ArtifactError
+from torchrl_priors.artifacts.errors import ArtifactError
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
 

@@ -243,7 +243,10 @@ def _build_uniform(
     if over == "box":
         low, high = _pop(left, f"{prefix}low"), _pop(left, f"{prefix}high")
         return UniformPrior(Bounded(low, high, shape=low.shape, dtype=low.dtype), namespace=namespace)
-    number = _pop(left, f"{prefix}logits").shape[-1]
+    logits = _pop(left, f"{prefix}logits")
+    if logits.ndim != 1 or not logits.isfinite().all():  # a shape such as [0, 2**33] takes no bytes of the file
+        raise ArtifactError(f"{prefix}logits must be finite and of one dimension")
+    number = len(logits)
     return UniformPrior(OneHot(number) if _distribution(over) is OneHotCategorical else number, namespace=namespace)
 
 

@@ -12,7 +12,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import TanhNormal
 
-from torchrl_priors.artifacts.format import ArtifactError
+from torchrl_priors.artifacts.errors import ArtifactError
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors import ModulePrior

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import sys
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_priors.artifacts.format import ArtifactError
-from torchrl_priors.artifacts.inert_pickle import InertPickleError, StandIn, read_pickle
+from torchrl_priors.artifacts.errors import ArtifactError, InertPickleError, short
+from torchrl_priors.artifacts.inert_pickle import MAX_BYTES, StandIn, read_pickle
+from torchrl_priors.artifacts.pickle_program import check_program
 
 __all__ = ["Checkpoint", "Space", "Statistics", "read_checkpoint", "read_vecnormalize"]
 
-_MAX_MEMBER = 1 << 31  # bytes of one unpacked member of the archive
+_MAX_WEIGHTS = 1 << 30  # bytes, unpacked; of all else, MAX_BYTES
 
 
 @dataclass(frozen=True)
@@ -101,13 +103,21 @@ def read_checkpoint(path: Path) -> Checkpoint:
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     if name not in archive.namelist():
         raise ArtifactError(f"it has no {name}: it is no model of Stable-Baselines3")
-    if archive.getinfo(name).file_size > _MAX_MEMBER:
-        raise ArtifactError(f"its {name} is longer than {_MAX_MEMBER} bytes")
+    limit = _MAX_WEIGHTS if name == "policy.pth" else MAX_BYTES
+    if archive.getinfo(name).file_size > limit:
+        raise ArtifactError(f"its {name} is longer than {limit} bytes")
     return archive.read(name)
 
 
 def _weights(data: bytes) -> dict[str, Tensor]:
     try:
+        # torch.load(weights_only=True) runs no code, but hashes what the pickle says, and unpacks what it claims
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > 2 * len(data):  # torch.save does not compress
+                raise ValueError("its entries are larger than it is")
+            for entry in archive.infolist():
+                if entry.filename.endswith(".pkl"):
+                    check_program(archive.read(entry))
         weights = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file fails in any way
         reason = (str(error).splitlines() or [""])[0]
@@ -116,6 +126,11 @@ def _weights(data: bytes) -> dict[str, Tensor]:
         isinstance(name, str) and isinstance(value, Tensor) for name, value in weights.items()
     ):
         raise ArtifactError("its policy.pth is no dictionary of tensors")
+    for name, value in weights.items():
+        if value.layout is not torch.strided or value.device.type != "cpu":
+            raise ArtifactError(f"{short(name)} must be a plain tensor, got {value.layout} on {value.device.type}")
+        if value.numel() * value.element_size() > len(data):  # a view of one number as many
+            raise ArtifactError(f"{short(name)} of shape {tuple(value.shape)} is larger than the file")
     return dict(weights)
 
 
@@ -139,8 +154,8 @@ def as_space(found: Any, name: str) -> Space:
     state = found.state
     if kind == "Discrete":
         n, start = state.get("n"), state.get("start", 0)
-        if type(n) is not int or type(start) is not int or n < 1:
-            raise ArtifactError(f"its {name} is damaged: Discrete with n={n!r}, start={start!r}")
+        if type(n) is not int or type(start) is not int or not 1 <= n < 1 << 31 or abs(start) >= 1 << 31:
+            raise ArtifactError(f"its {name} is damaged: Discrete with n={short(n)}, start={short(start)}")
         return Space(kind, n=n, start=start)
     low, high = state.get("low"), state.get("high")
     if not isinstance(low, np.ndarray) or not isinstance(high, np.ndarray) or low.shape != high.shape:
@@ -158,6 +173,8 @@ def read_vecnormalize(path: Path) -> Statistics | None:
     if not path.is_file():
         raise FileNotFoundError(f"No VecNormalize statistics at {path}.")
     try:
+        if (size := path.stat().st_size) > MAX_BYTES:
+            raise ArtifactError(f"it has {size} bytes, expected at most {MAX_BYTES}")
         found = read_pickle(path.read_bytes())
         if not isinstance(found, StandIn) or not found.pickled_name.endswith(".VecNormalize"):
             raise ArtifactError(f"it holds {type(found).__name__}, expected VecNormalize")
@@ -175,9 +192,9 @@ def read_vecnormalize(path: Path) -> Statistics | None:
         if not (np.isfinite(mean).all() and np.isfinite(var).all() and (var >= 0).all()):
             raise ArtifactError("its mean or variance is not finite, or negative")
         for name, value in (("epsilon", epsilon), ("clip_obs", clip)):
-            if not isinstance(value, (int, float)) or not 0 < value < float("inf"):
-                raise ArtifactError(f"its {name} must be a positive number, got {value!r}")
-    except (InertPickleError, ArtifactError) as error:
+            if not isinstance(value, (int, float)) or not 0 < value <= sys.float_info.max:
+                raise ArtifactError(f"its {name} must be a positive number, got {short(value)}")
+    except ArtifactError as error:
         raise ArtifactError(f"{path} can't be used as VecNormalize statistics: {error}.") from error
     as_tensor = torch.as_tensor
     return Statistics(as_tensor(mean).double(), as_tensor(var).double(), float(epsilon), float(clip))  # type: ignore[arg-type]

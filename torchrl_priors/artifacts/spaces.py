@@ -11,7 +11,7 @@ from torch import Tensor
 from torch import distributions as d
 from torchrl.data import Categorical, Composite, OneHot, TensorSpec
 
-from torchrl_priors.artifacts.format import ArtifactError
+from torchrl_priors.artifacts.errors import ArtifactError
 from torchrl_priors.priors.action_prior import ActionPrior, _action_shape
 
 __all__ = ["check_spaces"]

@@ -1,0 +1,83 @@
+"""Whether a pickle can be read in little time and memory: its program is followed, and nothing of it is built."""
+
+from __future__ import annotations
+
+import pickletools
+from typing import Any, NamedTuple
+
+from torchrl_priors.artifacts.errors import InertPickleError
+
+__all__ = ["check_program"]
+
+_MAX_STEPS = 1 << 18  # of the program; the statistics of a thousand environments have fewer
+_MAX_DEPTH = 32  # of tuples in tuples, and
+_MAX_ENTRIES = 1000  # what they have in all: a shape, or the state of an array, has a few
+
+
+class _Size(NamedTuple):
+    """Of an object that the program would build; only tuples have more than this."""
+
+    depth: int = 0
+    entries: int = 1
+
+
+def check_program(data: bytes) -> None:
+    """Refuses a pickle that would crash or never end in the hands of an unpickler that runs nothing.
+
+    The danger is in tuples, which are hashed when they are the key of a dictionary, at any depth and each time anew:
+    nested by the thousand, or each with the one before it twice. Other objects are held to the number of steps.
+
+    Args:
+        data (bytes): the pickle.
+
+    Raises:
+        InertPickleError: its program is too long, or has such tuples, or a memo with holes.
+        ValueError, LookupError: it is damaged.
+    """
+    stack: list[_Size] = []
+    marks: list[int] = []
+    memo: dict[int, _Size] = {}
+    for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+        name = opcode.name
+        if step >= _MAX_STEPS:
+            raise InertPickleError(f"it is a program of more than {_MAX_STEPS} steps")
+        if name == "MARK":
+            marks.append(len(stack))
+        elif name == "POP" and marks and marks[-1] == len(stack):
+            marks.pop()
+        elif name == "MEMOIZE":
+            memo[len(memo)] = stack[-1]
+        elif name.endswith("PUT"):
+            index: Any = argument
+            if not 0 <= index <= step:  # the unpickler makes a list of that length
+                raise InertPickleError("it is damaged: its memo is out of range")
+            memo[index] = stack[-1]
+        elif name.endswith("GET"):
+            stack.append(memo[argument])  # type: ignore[index]
+        elif name == "DUP":
+            stack.append(stack[-1])
+        else:
+            taken = _take(opcode, stack, marks)
+            made = _tuple_of(taken) if name in ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3") else _Size()
+            stack += [made] * len(opcode.stack_after)
+
+
+def _take(opcode: pickletools.OpcodeInfo, stack: list[_Size], marks: list[int]) -> list[_Size]:
+    """Takes from the stack what an instruction does: a number of objects, or all above a mark and some below it."""
+    below, above = opcode.stack_before, []
+    if pickletools.markobject in below:
+        below = below[: below.index(pickletools.markobject)]
+        start = marks.pop()
+        above = stack[start:]
+        del stack[start:]
+    start = len(stack) - len(below)
+    taken = stack[start:] + above
+    del stack[start:]
+    return taken
+
+
+def _tuple_of(parts: list[_Size]) -> _Size:
+    size = _Size(1 + max((part.depth for part in parts), default=0), 1 + sum(part.entries for part in parts))
+    if size.depth > _MAX_DEPTH or size.entries > _MAX_ENTRIES:
+        raise InertPickleError("it has tuples in tuples without end")
+    return size
