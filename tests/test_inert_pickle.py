@@ -112,7 +112,7 @@ def test_arrays_of_one_buffer_do_not_fill_the_memory() -> None:
     data = bytes(8000)
     assert read_pickle(pickle.dumps(View(data))).shape == (1000,)
     with pytest.raises(InertPickleError, match="its arrays are larger than it is"):
-        read_pickle(pickle.dumps([View(data)] + [View(data)]))
+        read_pickle(pickle.dumps([View(data), View(data)]))
 
 
 @pytest.mark.parametrize("value", [{(1, (2, 3)): ((), ((),))}, np.arange(3), spaces.Tuple([spaces.Discrete(2)] * 3)])

@@ -7,17 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import distributions as d
 from torch import nn
-from torchrl.data import Bounded
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
 from torchrl_priors import (
-    ActionPrior,
     AffordancePrior,
     BoltzmannPrior,
     CallablePrior,
@@ -28,8 +25,6 @@ from torchrl_priors import (
     UniformPrior,
     cross_entropy,
 )
-from torchrl_priors.artifacts import ArtifactError, load_policy, load_prior, read_manifest, save_prior
-from torchrl_priors.artifacts.prior import build_prior
 
 OBS, ACTIONS = 3, 4
 
@@ -313,105 +308,3 @@ class TestMixturePrior:
         ):
             with pytest.raises(error, match=match):
                 make()
-
-
-def net(out: int = ACTIONS) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(OBS, 8), nn.SiLU(), nn.Linear(8, out))
-
-
-class Own(nn.Tanh):
-    """A layer that no file knows."""
-
-
-STORABLE = {
-    "logits": lambda: ModulePrior(net(), "logits", in_keys=[("agent", "observation")]),
-    "mean": lambda: ModulePrior(net(), "mean", std=torch.tensor([0.1, 0.2, 0.3, 0.4])),
-    "squashed": lambda: ModulePrior(
-        net(), "mean", std=0.2, distribution_class=TanhNormal,
-        distribution_kwargs={"low": torch.zeros(ACTIONS), "high": 2 * torch.ones(ACTIONS)},
-    ),
-    "table": lambda: BoltzmannPrior(table(), 0.3),
-    "worlds": lambda: BoltzmannPrior(torch.stack([table(), table(1)]), distribution_class=OneHotCategorical),
-    "q_network": lambda: BoltzmannPrior(net(), 2.0),
-    "affordances": lambda: AffordancePrior(table() > 0.4, 0.2),
-    "uniform": lambda: UniformPrior(ACTIONS),
-    "box": lambda: UniformPrior(Bounded(torch.zeros(2), torch.ones(2), shape=(2,))),
-    "mixture": lambda: MixturePrior(
-        [BoltzmannPrior(table()), MixturePrior([ModulePrior(net(), "logits"), UniformPrior(ACTIONS)], [3.0, 1.0])],
-        torch.rand(5, 2),
-    ),
-    "gaussian_mixture": lambda: MixturePrior(
-        [ModulePrior(net(), "mean", std=0.1), ModulePrior(net(), "mean", std=0.2)], [0.2, 0.8]
-    ),
-}  # fmt: skip
-
-
-class TestFiles:
-    @pytest.mark.parametrize("name", STORABLE)
-    def test_round_trip(self, name: str, tmp_path: Any) -> None:
-        prior = STORABLE[name]()
-        manifest = save_prior(tmp_path / "prior", prior, env_id="Toy-v0", evaluation={"mean_return": 1.5})
-        loaded = load_prior(tmp_path / "prior", namespace="other", env_id="Toy-v0")
-        assert manifest == read_manifest(tmp_path / "prior")
-        assert type(loaded) is type(prior)
-        assert loaded.in_keys == prior.in_keys
-        x = torch.randn(2, 6, OBS)
-        batch = TensorDict(
-            observation=x, agent=TensorDict(observation=x, batch_size=[2, 6]), state=torch.randint(5, (2, 6)),
-            batch_size=[2, 6],
-        )  # fmt: skip
-        batch["action"] = prior.get_dist(batch).sample()
-        assert torch.equal(loaded.log_prob(batch), prior.log_prob(batch))
-        with pytest.raises(ArtifactError, match="load_prior reads"):
-            load_policy(tmp_path / "prior")
-
-    def test_another_key_can_be_read(self, tmp_path: Any) -> None:
-        save_prior(tmp_path / "prior", STORABLE["logits"](), env_id="Toy-v0")
-        assert load_prior(tmp_path / "prior", in_key="pixels").in_keys == ["pixels"]
-        save_prior(tmp_path / "prior", STORABLE["mixture"](), env_id="Toy-v0")
-        with pytest.raises(ArtifactError, match="in_key can't replace"):
-            load_prior(tmp_path / "prior", in_key="pixels")
-
-    @pytest.mark.parametrize(
-        ("prior", "match"),
-        [
-            (lambda: CallablePrior(lambda x: x, std=1.0), "can't hold a CallablePrior"),
-            (lambda: ModulePrior(Pair(), "mean_std"), "can't hold Pair"),
-            (lambda: AffordancePrior(lambda x: x), "can't hold code"),
-            (lambda: ModulePrior(nn.Sequential(net(), Own()), "logits"), "can't hold Own"),
-            (lambda: ModulePrior(nn.Sequential(nn.ELU(0.5), net()), "logits"), "default options"),
-            (lambda: MixturePrior([UniformPrior(2), CallablePrior(lambda x: 0, num_actions=2)]), "CallablePrior"),
-            (lambda: ModulePrior(net(), "logits").adversary(), "can't hold a NegatedPrior"),
-            (lambda: net(), "got Sequential"),
-        ],
-    )
-    def test_code_has_no_place_in_a_file(self, prior: Any, match: str, tmp_path: Any) -> None:
-        with pytest.raises(TypeError, match=match):
-            save_prior(tmp_path / "prior", prior(), env_id="Toy-v0")
-        assert not list(tmp_path.iterdir())
-
-    def test_a_description_that_does_not_fit_is_refused(self, tmp_path: Any) -> None:
-        save_prior(tmp_path / "prior", STORABLE["mean"](), env_id="Toy-v0")
-        tensors = safetensors.torch.load((tmp_path / "prior").read_bytes())
-        parts = read_manifest(tmp_path / "prior").prior  # type: ignore[union-attr]
-        assert isinstance(build_prior(tensors, parts), ActionPrior)
-        huge = {"layer": "linear", "sizes": [2**30, 2**30], "bias": True}
-        for change, match in (
-            ({"prior": "pickle"}, "kind of prior is unknown: 'pickle'"),
-            ({"network": huge}, "missing or unexpected"),
-            ({"network": {"layer": "linear", "sizes": [-1, 2], "bias": True}}, "positive integers"),
-            ({"network": {"layer": "os.system"}}, "layer is unknown: 'os.system'"),
-            ({"network": {"layer": "linear", "size": 3}}, "can't be built"),
-            ({"distribution": "Delta"}, "distribution is unknown"),
-            ({"output": "action"}, "Unknown output"),
-            ({"std": False}, "pass std"),
-            ({"in_keys": [3]}, "in_keys must be"),
-            ({"extra": 1}, "has the entries"),
-        ):
-            with pytest.raises(ArtifactError, match=match):
-                build_prior(tensors, {**parts, **change})
-        with pytest.raises(ArtifactError, match="unexpected: more"):
-            build_prior({**tensors, "more": torch.zeros(1)}, parts)
-        tensors["prior.network.0.bias"][0] = math.nan
-        with pytest.raises(ArtifactError, match="not finite"):
-            build_prior(tensors, parts)

@@ -198,9 +198,13 @@ def read_file(path: Path) -> tuple[dict[str, Tensor], PolicyManifest | PriorMani
 def _load(data: bytes) -> dict[str, Tensor]:
     safetensors = _safetensors()
     try:
-        return {name: value.clone() for name, value in safetensors.torch.load(data).items()}
+        tensors = {name: value.clone() for name, value in safetensors.torch.load(data).items()}
     except (safetensors.SafetensorError, KeyError, RuntimeError, ValueError) as error:  # e.g. a type torch lacks
-        raise ArtifactError(f"its tensors can't be read: {error!r}") from error
+        raise ArtifactError(f"its tensors can't be read: {error!r}") from None
+    for name, value in tensors.items():
+        if value.numel() == 0:  # [2**40, 0] takes no bytes of a file, and many of what is computed from it
+            raise ArtifactError(f"{name} is empty: it is of shape {tuple(value.shape)}")
+    return tensors
 
 
 def _read_bytes(path: Path) -> tuple[bytes, str, dict[str, Any]]:

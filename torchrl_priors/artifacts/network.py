@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_priors.artifacts.errors import ArtifactError
+from torchrl_priors.artifacts.errors import ArtifactError, differing
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
 
-__all__ = ["build_network", "describe_network"]
+__all__ = ["build_network", "check_values", "describe_network"]
 
 Parts = dict[str, Any]
 
@@ -57,13 +57,13 @@ def build_network(parts: Any, tensors: dict[str, Tensor]) -> nn.Module:
     """A network from its description and all of its tensors. No random number is drawn.
 
     Raises:
-        ArtifactError: they do not fit each other, or a tensor is not finite.
+        ArtifactError: they do not fit each other, a tensor is not finite, or see :func:`check_values`.
     """
     network = _skeleton(parts)
     expected = sizes(network)
     if tensors.keys() != expected.keys():
-        differing = ", ".join(sorted(tensors.keys() ^ expected.keys()))
-        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {differing}")
+        names = differing(tensors.keys() ^ expected.keys())
+        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {names}")
     for name, (shape, dtype) in expected.items():
         value = tensors[name]
         if tuple(value.shape) != shape or value.dtype is not dtype:
@@ -71,7 +71,26 @@ def build_network(parts: Any, tensors: dict[str, Tensor]) -> nn.Module:
         if not value.isfinite().all():
             raise ArtifactError(f"{name} is not finite: it has NaN or infinite entries")
     network.load_state_dict(tensors, assign=True)
+    check_values(network)
     return network
+
+
+def check_values(network: nn.Module) -> None:
+    """Refuses finite numbers that make what is not finite.
+
+    Raises:
+        ArtifactError: a variance of observations is negative, or a standard deviation overflows or vanishes.
+    """
+    for layer in network.modules():
+        if isinstance(layer, TeacherInput) and layer.var is not None and (layer.var < 0).any():
+            raise ArtifactError("the statistics of its observations have a negative variance")
+        if isinstance(layer, StateIndependentStd) and not _make_std(layer.log_std):
+            raise ArtifactError("its standard deviations, the exponentials of log_std, overflow or vanish")
+
+
+def _make_std(log_std: Tensor) -> bool:
+    std = log_std.exp()
+    return bool((std.isfinite() & (std > 0)).all())
 
 
 def _skeleton(parts: Any) -> nn.Module:
@@ -143,8 +162,17 @@ def _make_linear(*, sizes: Any, bias: Any) -> nn.Linear:
 
 
 def _make_head(*, sizes: Any, log_std_range: Any) -> GaussianHead:
-    if not isinstance(log_std_range, list) or len(log_std_range) != 2:
-        raise ArtifactError(f"log_std_range must be a pair of numbers, got {log_std_range!r}")
+    if (
+        not isinstance(log_std_range, list)
+        or len(log_std_range) != 2
+        or not all(type(bound) in (int, float) for bound in log_std_range)
+        or not log_std_range[0] <= log_std_range[1]
+        or not _make_std(torch.tensor(log_std_range, dtype=torch.float32, device="cpu"))
+    ):
+        raise ArtifactError(
+            "log_std_range must be a lower and an upper bound of the logarithm of a standard deviation, got"
+            f" {log_std_range!r}"
+        )
     low, high = map(float, log_std_range)
     return GaussianHead(*_counts(sizes, 2), log_std_range=(low, high))
 

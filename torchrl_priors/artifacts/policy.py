@@ -181,8 +181,8 @@ def load_prior(
         observation_spec (TensorSpec, sequence of int or int, optional): the student's raw observations, or the shape of
             one. Defaults to ``None``: not checked.
         action_spec (TensorSpec, sequence of int or int, optional): the student's actions, or the shape of one. Defaults
-            to ``None``: not checked here, but whenever an action is scored. Those of a :func:`save_prior` file are
-            checked here if ``observation_spec`` is given too.
+            to ``None``: not checked here, but whenever an action is scored. For a :func:`save_prior` file it needs
+            ``observation_spec`` too, and a number may be that of discrete actions.
         in_key (NestedKey, optional): *raw* observations ``[*B, obs_dim]``. Defaults to ``None``: ``"observation"``, or
             what the prior of a :func:`save_prior` file read.
         namespace (NestedKey): the parameters are written under ``(namespace, name)``. Defaults to ``"prior"``.
@@ -192,6 +192,7 @@ def load_prior(
         FileNotFoundError: there is no such file.
         ArtifactError: as :func:`load_policy`, or the teacher is of another environment or other spaces.
         TypeError: a spec is one of several entries.
+        ValueError: ``action_spec`` without ``observation_spec``, for a :func:`save_prior` file.
         ImportError: safetensors is not installed.
     """
     tensors, manifest = read_file(Path(path))
@@ -205,6 +206,11 @@ def load_prior(
             prior = build_prior(tensors, manifest.prior, in_key=in_key, namespace=namespace)
             if observation_spec is not None:
                 check_spaces(prior, observation_spec, action_spec)
+            elif action_spec is not None:
+                raise ValueError(
+                    f"{path} is a prior of save_prior, which is asked about an observation to check its actions:"
+                    " observation_spec is needed beside action_spec."
+                )
         except ArtifactError as error:
             raise ArtifactError(f"{path} can't be used as a prior: {error}.") from error
         return prior.to(device)

@@ -7,20 +7,31 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from tensordict.utils import unravel_key
 from torch import Tensor, nn
-from torch import distributions as d
 from torchrl.data import Bounded, OneHot
-from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
+from torchrl.modules import OneHotCategorical
 
-from torchrl_priors.artifacts.format import PRIOR, ArtifactError, PriorManifest, pack, write_atomically
-from torchrl_priors.artifacts.network import build_network, describe_network
-from torchrl_priors.lookup import StateTable
+from torchrl_priors.artifacts.errors import ArtifactError, differing
+from torchrl_priors.artifacts.format import PRIOR, PriorManifest, pack, write_atomically
+from torchrl_priors.artifacts.network import build_network
+from torchrl_priors.artifacts.prior_parts import (
+    Tensors,
+    find_distribution,
+    keys_from_json,
+    keys_to_json,
+    name_distribution,
+    put_network,
+    put_source,
+    take_bounds,
+    take_options,
+    take_source,
+    take_tensor,
+    take_tensors,
+)
 from torchrl_priors.priors import (
     ActionPrior,
     AffordancePrior,
@@ -29,18 +40,8 @@ from torchrl_priors.priors import (
     ModulePrior,
     UniformPrior,
 )
-from torchrl_priors.priors.mixture import FixedWeights, distribution_class
 
 __all__ = ["build_prior", "save_prior"]
-
-Tensors = dict[str, Tensor]
-_Prior = TypeVar("_Prior", bound=ActionPrior)
-_DISTRIBUTIONS: dict[str, Any] = {
-    "categorical": d.Categorical,
-    "one_hot": OneHotCategorical,
-    "normal": IndependentNormal,
-    "tanh_normal": TanhNormal,
-}
 
 
 def save_prior(
@@ -55,7 +56,8 @@ def save_prior(
 
     Tables and networks of known layers go into a file, and so do mixtures of such priors. Code does not: a
     :class:`CallablePrior`, a function, a network with layers of its own. A policy of
-    :func:`~torchrl_priors.networks.make_actor` is for :func:`save_policy`.
+    :func:`~torchrl_priors.networks.make_actor` is for :func:`save_policy`; what :func:`load_prior` makes of such a file
+    can't be written again, in a mixture neither: keep the file, and mix what it gives.
 
     Args:
         path (str or path): the file; its folder exists. A file of that name is replaced.
@@ -125,9 +127,9 @@ def build_prior(
     except ArtifactError:
         raise
     except (ArithmeticError, LookupError, RecursionError, RuntimeError, TypeError, ValueError) as error:
-        raise ArtifactError(f"its prior can't be built: {type(error).__name__}: {error}") from error
+        raise ArtifactError(f"its prior can't be built: {type(error).__name__}: {error}") from None
     if left:
-        raise ArtifactError(f"its tensors are not those of its manifest; unexpected: {', '.join(sorted(left))}")
+        raise ArtifactError(f"its tensors are not those of its manifest; unexpected: {differing(left)}")
     return prior
 
 
@@ -140,7 +142,8 @@ def _describe(prior: ActionPrior, tensors: Tensors, prefix: str) -> dict[str, An
             return {"prior": name, **describe(prior, tensors, prefix)}
     raise TypeError(
         f"A file can hold priors of {', '.join(kind.__name__ for kind, *_ in _KINDS.values())}, and no code of others:"
-        f" it can't hold a {type(prior).__name__}."
+        f" it can't hold this {type(prior).__name__}. (load_prior makes an ActionPrior of a file of save_policy: keep"
+        " that file.)"
     )
 
 
@@ -163,30 +166,28 @@ def _describe_module(prior: ModulePrior, tensors: Tensors, prefix: str) -> dict[
     for name in kwargs:
         tensors[prefix + name] = torch.as_tensor(kwargs[name])
     return {
-        "network": _put_network(params.network, tensors, f"{prefix}network."),
+        "network": put_network(params.network, tensors, f"{prefix}network."),
         "output": prior.output,
         "std": params.std is not None,
-        "distribution": _distribution_name(prior),
+        "distribution": name_distribution(prior),
         "box": box,
-        "in_keys": _to_json(prior.in_keys),
+        "in_keys": keys_to_json(prior.in_keys),
     }
 
 
 def _build_module(
     left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
 ) -> ModulePrior:
-    network, output, std, distribution, box, keys = _take(
+    network, output, std, distribution, box, keys = take_options(
         options, "network", "output", "std", "distribution", "box", "in_keys"
     )
-    bounds = {name: _pop(left, prefix + name) for name in ("low", "high")} if box else None
-    if bounds is not None and not (bounds["low"] < bounds["high"]).all():
-        raise ArtifactError("the lower bounds of its actions must be below the upper ones")
+    bounds = take_bounds(left, prefix) if box else None
     return ModulePrior(
-        build_network(network, _strip(left, f"{prefix}network.")),
+        build_network(network, take_tensors(left, f"{prefix}network.")),
         output,
-        std=_pop(left, f"{prefix}std") if std else None,
-        in_keys=_keys(keys, in_key),
-        distribution_class=_distribution(distribution),
+        std=take_tensor(left, f"{prefix}std") if std else None,
+        in_keys=keys_from_json(keys, in_key),
+        distribution_class=find_distribution(distribution),
         distribution_kwargs=bounds,
         namespace=namespace,
     )
@@ -195,37 +196,47 @@ def _build_module(
 def _describe_values(prior: BoltzmannPrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
     source, softmax, _ = prior.module
     return {
-        "q": _put_source(source, tensors, f"{prefix}q."),
+        "q": put_source(source, tensors, f"{prefix}q."),
         "temperature": float(softmax.module.temperature),
-        "distribution": _distribution_name(prior),
+        "distribution": name_distribution(prior),
     }
 
 
 def _build_values(
     left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
 ) -> BoltzmannPrior:
-    q, temperature, distribution = _take(options, "q", "temperature", "distribution")
-    values, in_keys = _take_source(q, left, f"{prefix}q.", in_key)
+    q, temperature, distribution = take_options(options, "q", "temperature", "distribution")
+    values, in_keys = take_source(q, left, f"{prefix}q.", in_key)
+    _check_temperature(temperature, values)
     return BoltzmannPrior(
-        values, temperature, in_keys=in_keys, distribution_class=_distribution(distribution), namespace=namespace
+        values, temperature, in_keys=in_keys, distribution_class=find_distribution(distribution), namespace=namespace
     )
+
+
+def _check_temperature(temperature: Any, values: Tensor | nn.Module) -> None:
+    """A finite number can still be 0 in float32, or make a finite action value infinite."""
+    divisor = torch.tensor(float(temperature)) if type(temperature) in (int, float) else torch.tensor(0.0)
+    if not 0 < divisor < torch.inf:
+        raise ArtifactError(f"its temperature must be a positive number, got {temperature!r}")
+    if isinstance(values, Tensor) and ((values / divisor).isfinite() != values.isfinite()).any():
+        raise ArtifactError(f"its action values overflow at temperature {temperature!r}")
 
 
 def _describe_affordances(prior: AffordancePrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
     return {
-        "weights": _put_source(prior.module[0], tensors, f"{prefix}weights."),
+        "weights": put_source(prior.module[0], tensors, f"{prefix}weights."),
         "epsilon": prior.epsilon,
-        "distribution": _distribution_name(prior),
+        "distribution": name_distribution(prior),
     }
 
 
 def _build_affordances(
     left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
 ) -> AffordancePrior:
-    weights, epsilon, distribution = _take(options, "weights", "epsilon", "distribution")
-    source, in_keys = _take_source(weights, left, f"{prefix}weights.", in_key)
+    weights, epsilon, distribution = take_options(options, "weights", "epsilon", "distribution")
+    source, in_keys = take_source(weights, left, f"{prefix}weights.", in_key)
     return AffordancePrior(
-        source, epsilon, in_keys=in_keys, distribution_class=_distribution(distribution), namespace=namespace
+        source, epsilon, in_keys=in_keys, distribution_class=find_distribution(distribution), namespace=namespace
     )
 
 
@@ -233,38 +244,38 @@ def _describe_uniform(prior: UniformPrior, tensors: Tensors, prefix: str) -> dic
     constant = prior.module[0]
     for name in constant.out_keys:
         tensors[prefix + name] = getattr(constant, name)
-    return {"over": "box" if "low" in constant.out_keys else _distribution_name(prior)}
+    return {"over": "box" if "low" in constant.out_keys else name_distribution(prior)}
 
 
 def _build_uniform(
     left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
 ) -> UniformPrior:
-    (over,) = _take(options, "over")
+    (over,) = take_options(options, "over")
     if over == "box":
-        low, high = _pop(left, f"{prefix}low"), _pop(left, f"{prefix}high")
-        return UniformPrior(Bounded(low, high, shape=low.shape, dtype=low.dtype), namespace=namespace)
-    logits = _pop(left, f"{prefix}logits")
+        low = (bounds := take_bounds(left, prefix))["low"]
+        return UniformPrior(Bounded(**bounds, shape=low.shape, dtype=low.dtype), namespace=namespace)
+    logits = take_tensor(left, f"{prefix}logits")
     if logits.ndim != 1 or not logits.isfinite().all():  # a shape such as [0, 2**33] takes no bytes of the file
-        raise ArtifactError(f"{prefix}logits must be finite and of one dimension")
+        raise ArtifactError(f"{prefix}logits must be finite and of one dimension, got shape {tuple(logits.shape)}")
     number = len(logits)
-    return UniformPrior(OneHot(number) if _distribution(over) is OneHotCategorical else number, namespace=namespace)
+    return UniformPrior(OneHot(number) if find_distribution(over) is OneHotCategorical else number, namespace=namespace)
 
 
 def _describe_mixture(prior: MixturePrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
     return {
         "priors": [_describe(part, tensors, f"{prefix}{number}.") for number, part in enumerate(prior.priors)],
-        "weights": _put_source(prior.weights, tensors, f"{prefix}weights."),
+        "weights": put_source(prior.weights, tensors, f"{prefix}weights."),
     }
 
 
 def _build_mixture(
     left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
 ) -> MixturePrior:
-    priors, weights = _take(options, "priors", "weights")
+    priors, weights = take_options(options, "priors", "weights")
     if not isinstance(priors, list):
         raise ArtifactError(f"a mixture must have a list of priors, got {priors!r}")
     built = [_build(part, left, f"{prefix}{number}.", in_key, "prior") for number, part in enumerate(priors)]
-    source, in_keys = _take_source(weights, left, f"{prefix}weights.", in_key)
+    source, in_keys = take_source(weights, left, f"{prefix}weights.", in_key)
     return MixturePrior(built, source, in_keys=in_keys, namespace=namespace)
 
 
@@ -275,82 +286,3 @@ _KINDS: dict[str, tuple[type[ActionPrior], Callable[..., dict[str, Any]], Callab
     "uniform": (UniformPrior, _describe_uniform, _build_uniform),
     "mixture": (MixturePrior, _describe_mixture, _build_mixture),
 }
-
-
-# What the kinds are made of: networks, and tables or networks by state.
-
-
-def _put_network(network: Any, tensors: Tensors, prefix: str) -> dict[str, Any]:
-    if not isinstance(network, nn.Module):
-        raise TypeError(f"A file can't hold code, such as the function {network!r}.")
-    tensors |= {prefix + name: value for name, value in network.state_dict().items()}
-    return describe_network(network)
-
-
-def _put_source(source: TensorDictModuleBase, tensors: Tensors, prefix: str) -> dict[str, Any]:
-    if type(source) is TensorDictModule:
-        network = _put_network(source.module, tensors, f"{prefix}network.")
-        return {"network": network, "in_keys": _to_json(source.in_keys)}
-    if type(source) is StateTable:
-        tensors[f"{prefix}table"] = source.table
-        return {"in_keys": _to_json(source.in_keys)}
-    if type(source) is FixedWeights:
-        tensors[f"{prefix}table"] = source.values
-        return {"in_keys": []}
-    raise TypeError(f"A file can hold tables and plain networks by state, and no code of others: no {source}.")
-
-
-def _take_source(
-    parts: Any, left: Tensors, prefix: str, in_key: NestedKey | None
-) -> tuple[Tensor | nn.Module, list[NestedKey] | None]:
-    if not isinstance(parts, dict) or not {"in_keys"} <= parts.keys() <= {"in_keys", "network"}:
-        raise ArtifactError(f"values by state must be a table or a network with its in_keys, got {parts!r}")
-    keys = _keys(parts["in_keys"], in_key) if parts["in_keys"] != [] else None
-    if "network" in parts:
-        return build_network(parts["network"], _strip(left, f"{prefix}network.")), keys
-    return _pop(left, f"{prefix}table"), keys
-
-
-def _take(options: dict[str, Any], *names: str) -> tuple[Any, ...]:
-    if options.keys() != set(names):
-        raise ArtifactError(f"a prior of its kind has the entries {', '.join(names)}, got {', '.join(options)}")
-    return tuple(options[name] for name in names)
-
-
-def _strip(left: Tensors, prefix: str) -> Tensors:
-    """Takes the tensors under a prefix."""
-    return {name.removeprefix(prefix): left.pop(name) for name in list(left) if name.startswith(prefix)}
-
-
-def _pop(left: Tensors, name: str) -> Tensor:
-    if name not in left:
-        raise ArtifactError(f"its tensors are not those of its manifest; missing: {name}")
-    return left.pop(name)
-
-
-def _distribution_name(prior: ActionPrior) -> str:
-    kind = distribution_class(prior)
-    for name, known in _DISTRIBUTIONS.items():
-        if kind is known:
-            return name
-    raise TypeError(f"A file can hold distributions of kind {', '.join(_DISTRIBUTIONS)}, got {kind}.")
-
-
-def _distribution(name: Any) -> Any:
-    if not isinstance(name, str) or name not in _DISTRIBUTIONS:
-        raise ArtifactError(f"its distribution is unknown: {name!r}")
-    return _DISTRIBUTIONS[name]
-
-
-def _to_json(keys: list[NestedKey]) -> list[list[str]]:
-    return [[key] if isinstance(key, str) else list(key) for key in keys]
-
-
-def _keys(values: Any, in_key: NestedKey | None) -> list[NestedKey]:
-    if (
-        not isinstance(values, list)
-        or not values
-        or not all(isinstance(key, list) and key and all(isinstance(part, str) for part in key) for key in values)
-    ):
-        raise ArtifactError(f"its in_keys must be lists of names, got {values!r}")
-    return [unravel_key(tuple(key)) for key in values] if in_key is None else [in_key]

@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
-from torchrl.modules import TanhNormal
+from torchrl.modules import OneHotCategorical, TanhNormal
 
-from torchrl_priors.artifacts.errors import ArtifactError
+from torchrl_priors.artifacts.errors import ArtifactError, differing
+from torchrl_priors.artifacts.network import check_values
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors import ModulePrior
@@ -27,6 +28,7 @@ def load_sb3_prior(
     vecnormalize: str | os.PathLike[str] | None = None,
     std: float | Tensor | None = None,
     activation: str | None = None,
+    one_hot: bool = False,
     in_key: NestedKey = "observation",
     namespace: NestedKey = "prior",
     device: torch.device | str | None = None,
@@ -38,12 +40,13 @@ def load_sb3_prior(
 
     What the teacher's distribution is, in the unit of the environment's actions:
 
-    * PPO, A2C, discrete actions: a :class:`~torch.distributions.Categorical` over indices;
+    * PPO, A2C, discrete actions: a :class:`~torch.distributions.Categorical` over indices, or, with ``one_hot``, a
+      :class:`~torchrl.modules.OneHotCategorical`, as the students of a :class:`~torchrl.envs.GymEnv` are by default;
     * PPO, A2C, continuous: a Gaussian, before the clipping to the bounds that Stable-Baselines3 does when it acts;
     * SAC: a :class:`~torchrl.modules.TanhNormal` within the bounds. Stable-Baselines3's own ``log_prob`` is that of
       actions scaled to [-1, 1], and adds 1e-6 to :math:`1-\tanh^2`; this one is exact;
-    * TD3, and any other continuous one with ``std``: a Gaussian around the deterministic action. Prefer it for SAC
-      where the student's actions can leave the bounds, for there a squashed teacher has no finite opinion.
+    * TD3, and any other continuous one with ``std``: a Gaussian around the deterministic action. A Gaussian student of
+      a SAC teacher needs it: its actions can leave the bounds, where a squashed teacher has no finite opinion.
 
     It can be written to a file of this library by :func:`save_prior`. ``python -m recipes.export_sb3`` does both.
 
@@ -54,9 +57,12 @@ def load_sb3_prior(
         vecnormalize (str or path, optional): the file of ``VecNormalize.save``, whose statistics the policy was trained
             with. Defaults to ``None``: it reads raw observations.
         std (float or Tensor, optional): standard deviation of a Gaussian around the deterministic action, in the unit
-            of the action; required for TD3. Defaults to ``None``: the policy's own distribution.
-        activation (str, optional): one of :data:`~torchrl_priors.networks.ACTIVATIONS`. Defaults to ``None``: what the
-            file says, else Stable-Baselines3's default (tanh for PPO and A2C, ReLU for SAC and TD3).
+            of the action, a number or one per dimension; required for TD3. Defaults to ``None``: the policy's own
+            distribution.
+        activation (str, optional): what the policy must have, one of :data:`~torchrl_priors.networks.ACTIVATIONS`: only
+            a check, for what the file says counts, and if it says nothing Stable-Baselines3's default (tanh for PPO and
+            A2C, ReLU for SAC and TD3). Defaults to ``None``: not checked.
+        one_hot (bool): whether discrete actions are one-hot ``[*B, A]``, not indices ``[*B]``. Defaults to ``False``.
         in_key (NestedKey): raw observations ``[*B, *obs]``, images with channels first. Defaults to ``"observation"``.
         namespace (NestedKey): as in :class:`~torchrl_priors.ActionPrior`.
         device (torch.device, optional): defaults to the CPU.
@@ -66,7 +72,8 @@ def load_sb3_prior(
         ArtifactError: a file is damaged or none of Stable-Baselines3; or the policy is of a kind that can't be read:
             observations of several entries or discrete ones, actions that are neither ``Discrete`` nor a ``Box`` of one
             dimension, state-dependent exploration, recurrent or custom networks.
-        ValueError: TD3 without ``std``, ``std`` with discrete actions, or an activation that contradicts the file.
+        ValueError: TD3 without ``std``, ``std`` with discrete actions or of another size than the actions, ``one_hot``
+            with continuous ones, or an activation that the policy does not have.
     """
     try:
         checkpoint = read_checkpoint(Path(path))
@@ -87,6 +94,13 @@ def load_sb3_prior(
         raise ValueError(f"{path} is a deterministic policy (TD3): pass std, its spread in the unit of the action.")
     if discrete and std is not None:
         raise ValueError(f"{path} is a policy over discrete actions: std={std} is of no use.")
+    if one_hot and not discrete:
+        raise ValueError(f"{path} is a policy over continuous actions: one_hot=True is of no use.")
+    if std is not None and torch.as_tensor(std).shape not in ((), checkpoint.action_space.shape):
+        raise ValueError(
+            f"std must be a number or have one for each of {checkpoint.action_space.shape[0]} dimensions of the actions"
+            f" of {path}, got shape {tuple(torch.as_tensor(std).shape)}."
+        )
     try:
         kind = _activation(checkpoint, "relu" if off_policy else "tanh", activation)
         parts = _Parts(checkpoint.weights)
@@ -102,11 +116,14 @@ def load_sb3_prior(
                 layers += [StateIndependentStd(log_std)] if std is None else []
         parts.check_all_taken()
         _check_sizes(layers, checkpoint)
+        check_values(nn.Sequential(*layers))
     except ArtifactError as error:
         raise ArtifactError(f"{path} can't be used as a Stable-Baselines3 policy: {error}.") from error
     if squashed and std is None:
         low, high = _bounds(checkpoint)
         kwargs |= {"distribution_class": TanhNormal, "distribution_kwargs": {"low": low, "high": high}}
+    if one_hot:
+        kwargs["distribution_class"] = OneHotCategorical
     output = "logits" if discrete else "mean_std" if std is None else "mean"
     return ModulePrior(nn.Sequential(*layers), output, std=std, **kwargs).to(device)  # type: ignore[arg-type]
 
@@ -115,10 +132,10 @@ def _check(checkpoint: Checkpoint) -> None:
     """Refuses what can't be converted."""
     if checkpoint.use_sde or checkpoint.options.get("use_sde"):
         raise ArtifactError("it explores by state-dependent noise (use_sde=True), which is not supported")
-    if not re.match(r"stable_baselines3\.\w+\.policies$", checkpoint.policy_module):
+    if not re.fullmatch(r"stable_baselines3\.(common|ppo|a2c|sac|td3)\.policies", checkpoint.policy_module):
         raise ArtifactError(
-            f"its policy class is one of {checkpoint.policy_module or 'an unknown module'}, and only those of"
-            " stable_baselines3 are known; ModulePrior takes any network"
+            f"its policy class is one of {checkpoint.policy_module or 'an unknown module'}, and only those of PPO, A2C,"
+            " SAC and TD3 in stable_baselines3 are known; ModulePrior takes any network"
         )
     if checkpoint.observation_space.kind != "Box":
         raise ArtifactError(f"its observations are a {checkpoint.observation_space.kind} space, a Box is supported")
@@ -138,18 +155,17 @@ def _check(checkpoint: Checkpoint) -> None:
 
 
 def _activation(checkpoint: Checkpoint, default: str, given: str | None) -> type[nn.Module]:
-    """The activation that was asked for, or the file's, or the default."""
+    """The activation that the file names, or the default, which is what Stable-Baselines3 makes of it too."""
     known = {f"<class 'torch.nn.modules.activation.{kind.__name__}'>": name for name, kind in ACTIVATIONS.items()}
     written = checkpoint.options.get("activation_fn")
     if written is not None and str(written) not in known:
         raise ArtifactError(f"its activation is {written}, known are {', '.join(sorted(ACTIVATIONS))}")
     if given is not None and given not in ACTIVATIONS:
         raise ValueError(f"Unknown activation {given!r}: choose one of {', '.join(sorted(ACTIVATIONS))}.")
-    if written is None:
-        return ACTIVATIONS[given or default]
-    if given is not None and given != known[str(written)]:
-        raise ValueError(f"activation={given!r} contradicts the file, whose policy has {known[str(written)]!r}.")
-    return ACTIVATIONS[known[str(written)]]
+    found = default if written is None else known[str(written)]
+    if given is not None and given != found:
+        raise ValueError(f"activation={given!r} contradicts the file, whose policy has {found!r}.")
+    return ACTIVATIONS[found]
 
 
 def _bounds(checkpoint: Checkpoint) -> tuple[Tensor, Tensor]:
@@ -268,4 +284,4 @@ class _Parts:
 
     def check_all_taken(self) -> None:
         if self.left:
-            raise ArtifactError(f"its policy has parts that are not known: {', '.join(sorted(self.left))}")
+            raise ArtifactError(f"its policy has parts that are not known: {differing(self.left)}")

@@ -12,7 +12,7 @@ from torch import distributions as d
 from torchrl.data import Categorical, Composite, OneHot, TensorSpec
 
 from torchrl_priors.artifacts.errors import ArtifactError
-from torchrl_priors.priors.action_prior import ActionPrior, _action_shape
+from torchrl_priors.priors.action_prior import _ONE_HOT, ActionPrior, _action_shape
 
 __all__ = ["check_spaces"]
 
@@ -23,9 +23,9 @@ def check_spaces(prior: ActionPrior, observation_spec: Spec, action_spec: Spec |
     """Asks a prior about one observation, and holds its distribution against the actions.
 
     Args:
-        prior (ActionPrior): reads one key.
+        prior (ActionPrior): reads one key at most.
         observation_spec (TensorSpec, sequence of int or int): the observations, or the shape of one.
-        action_spec (TensorSpec, sequence of int or int, optional): the actions, or the shape of one.
+        action_spec (TensorSpec, sequence of int or int, optional): the actions, the shape of one, or their number.
 
     Raises:
         ArtifactError: it can't read the observations, or advises on other actions.
@@ -34,27 +34,37 @@ def check_spaces(prior: ActionPrior, observation_spec: Spec, action_spec: Spec |
     for spec in (observation_spec, action_spec):
         if isinstance(spec, Composite):
             raise TypeError(f"Pass the spec of one entry, not of several: {', '.join(map(str, spec.keys()))}.")
-    if len(prior.in_keys) != 1:
+    if len(prior.in_keys) > 1:
         raise ArtifactError(f"it reads {prior.in_keys}, and observations of one key can be checked")
     observation = _zero(observation_spec)
     try:
-        dist: Any = prior.get_dist(TensorDict({prior.in_keys[0]: observation.unsqueeze(0)}, [1]))
+        dist = prior.get_dist(TensorDict({key: observation.unsqueeze(0) for key in prior.in_keys}, [1]))
     except (IndexError, RuntimeError, TypeError, ValueError) as error:
         shape = tuple(observation.shape)
         raise ArtifactError(f"it can't read observations of shape {shape}, {observation.dtype}: {error}") from error
-    if action_spec is None:
-        return
-    advised: tuple[int, ...] = tuple(_action_shape(dist)[1:])
-    discrete = type(dist) is d.Categorical
-    if isinstance(action_spec, Categorical) and not isinstance(action_spec, OneHot):
-        fits = discrete and dist.logits.shape[-1] == action_spec.n
-    elif isinstance(action_spec, TensorSpec):
-        fits = not discrete and tuple(action_spec.shape[-1:]) == advised
+    if action_spec is not None:
+        _check_actions(dist, action_spec)
+
+
+def _check_actions(dist: Any, spec: Spec) -> None:
+    """Holds a distribution against the actions, whose spec may have the batch of several environments in front."""
+    advised: tuple[int, ...] = tuple(_action_shape(dist)[len(dist.batch_shape) :])
+    one_hot = isinstance(dist, _ONE_HOT)
+    number = dist.logits.shape[-1] if type(dist) is d.Categorical else None  # of indices
+    if isinstance(spec, int):
+        fits = number == spec if number is not None else advised == (spec,)
+    elif not isinstance(spec, TensorSpec):
+        fits = advised == tuple(spec)
+    elif type(spec) is Categorical:
+        fits = number == spec.n
+    elif type(spec) is OneHot:
+        fits = one_hot and tuple(spec.shape[-1:]) == advised
     else:
-        fits = advised == ((action_spec,) if isinstance(action_spec, int) else tuple(action_spec))
+        continuous = number is None and not one_hot and spec.dtype.is_floating_point
+        fits = continuous and tuple(spec.shape[spec.ndim - len(advised) :]) == advised
     if not fits:
-        over = f"{dist.logits.shape[-1]} indices" if discrete else f"shape {advised}"
-        raise ArtifactError(f"it advises on actions of {over}, and the student's are {action_spec}")
+        over = f"{number} indices" if number is not None else f"shape {advised}{', one-hot' if one_hot else ''}"
+        raise ArtifactError(f"it advises on actions of {over}, and the student's are {spec}")
 
 
 def _zero(spec: Spec) -> Tensor:
