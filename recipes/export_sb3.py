@@ -12,9 +12,11 @@ from pathlib import Path
 import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
+from torchrl.modules import TanhNormal
 
 from recipes.checks import refuse_unknown_keys
 from torchrl_priors.artifacts import load_sb3_prior, save_prior
+from torchrl_priors.priors.mixture import distribution_class
 
 
 @dataclass
@@ -33,9 +35,19 @@ ConfigStore.instance().store(group="schema", name="export_sb3", node=ExportConfi
 
 
 def export(cfg: ExportConfig) -> None:
-    """Convert the policy, and write it."""
+    """Convert the policy, and write it.
+
+    Raises:
+        ValueError: see :func:`load_sb3_prior`; or it is one that the students of ``recipes.mujoco`` can't learn from.
+    """
     refuse_unknown_keys(cfg)
     prior = load_sb3_prior(cfg.model, vecnormalize=cfg.vecnormalize, std=cfg.std, activation=cfg.activation)
+    if distribution_class(prior) is TanhNormal:
+        raise ValueError(
+            f"std=null: {cfg.model} is a SAC policy, whose squashed Gaussian has no finite opinion beyond the bounds of"
+            " the actions, and the students of recipes.mujoco are Gaussians: set std, the spread around its action, in"
+            " the unit of the action. (save_prior writes it as it is.)"
+        )
     files = {"model": cfg.model, "vecnormalize": cfg.vecnormalize}
     training = {name: None if path is None else Path(path).name for name, path in files.items()}
     save_prior(cfg.out, prior, env_id=cfg.env_id, training={"from": "stable_baselines3", **training})

@@ -611,12 +611,12 @@ class TestWithoutSafetensors:
             "except ImportError as error: print(error)"
         )
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert "pip install 'torchrl-priors[mujoco]'" in done.stdout
+        assert "pip install 'torchrl-priors[artifacts]'" in done.stdout
 
     def test_saving_says_what_to_install(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "safetensors", None)
         monkeypatch.setitem(sys.modules, "safetensors.torch", None)
-        with pytest.raises(ImportError, match=r"torchrl-priors\[mujoco\]"):
+        with pytest.raises(ImportError, match=r"torchrl-priors\[artifacts\]"):
             save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), None, env_id="Hopper-v5")
         assert not list(tmp_path.iterdir())
 

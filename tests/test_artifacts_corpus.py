@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 from artifact_corpus import not_files, write_corpus
+from sb3_corpus import write_sb3_corpus
 
 from torchrl_priors import BoltzmannPrior, MixturePrior, ModulePrior
 from torchrl_priors.artifacts import load_policy, load_prior, read_manifest, save_policy, save_prior
@@ -53,6 +54,27 @@ for path in sorted(folder.iterdir()):
         outcome.append([type(error).__name__, str(error)])
     outcomes[path.name] = outcome
 print(json.dumps({"outcomes": outcomes, "events": sorted(events), "opened": sorted(opened)}))
+"""
+
+# The same for the files of Stable-Baselines3. PyTorch reads their weights, and imports and opens what it likes.
+SB3_READER = """
+import json, resource, sys
+from pathlib import Path
+from torchrl_priors.artifacts import load_sb3_prior
+
+folder, good, vecnormalize = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+load_sb3_prior(good, vecnormalize=vecnormalize)
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 2**30, used + 2**30))
+outcomes = {}
+for path in sorted(folder.iterdir()):
+    try:
+        load_sb3_prior(good, vecnormalize=path) if path.suffix == ".pkl" else load_sb3_prior(path)
+        error = None
+    except BaseException as caught:
+        error = caught
+    outcomes[path.name] = type(error).__name__, str(error)
+print(json.dumps(outcomes))
 """
 
 
@@ -107,6 +129,31 @@ def test_a_thousand_damaged_and_foreign_files_are_refused_and_do_nothing(
     assert told["events"] == ["open"]  # nothing was compiled, imported, unpickled, started or sent
     assert {mode for _, mode in told["opened"]} <= {"r", "rb"}
     assert {Path(path).parent for path, _ in told["opened"]} == {corpus}
+    assert snapshot(corpus) == before
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_hundreds_of_files_of_stable_baselines3_are_refused_and_do_nothing(tmp_path: Path) -> None:
+    from sb3_cases import save_model
+
+    corpus, elsewhere = tmp_path / "corpus", tmp_path / "elsewhere"
+    corpus.mkdir()
+    elsewhere.mkdir()
+    model = save_model("a2c_linear", tmp_path)
+    assert model.vecnormalize is not None
+    write_sb3_corpus(corpus, model.path.read_bytes(), model.vecnormalize.read_bytes(), seed=0)
+    before = snapshot(corpus)
+    command = [sys.executable, "-c", SB3_READER, str(corpus), str(model.path), str(model.vecnormalize)]
+    done = subprocess.run(command, cwd=elsewhere, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]  # no crash
+    outcomes = json.loads(done.stdout)
+    assert len(outcomes) == len(before) >= 300
+    wrong = {
+        name: (kind, message)
+        for name, (kind, message) in outcomes.items()
+        if kind != "ArtifactError" or name not in message or not message.isprintable() or len(message) > 2000
+    }
+    assert wrong == {}
     assert snapshot(corpus) == before
     assert list(elsewhere.iterdir()) == []
 

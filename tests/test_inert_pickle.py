@@ -86,7 +86,7 @@ def twice(times: int) -> bytes:
         (b"\x80\x04}" + twice(60) + b"K\x01s.", "tuples in tuples"),  # hashing one never ends
         (BEFORE + twice(20) + AFTER, "tuples in tuples"),  # writing it into a message needs 100 MB
         (b"\x80\x04(" + b"K\x01" * 2000 + b"t.", "tuples in tuples"),
-        (b"\x80\x04]" + b"]a" * 200_000 + b".", "more than 262144 steps"),
+        (b"\x80\x04]" + b"]a" * 70_000 + b".", "more than 131072 steps"),
         (BEFORE + b"(" + b"\x8a\xff" + b"\x7f" * 255 + b"t" + AFTER, r"array of shape \(\d+\.\.\."),
         (BEFORE + b"(" + b"K\x01" * 40 + b"t" + AFTER, r"array of shape \(1, 1, "),
         (b"\x80\x04]q\xffp1000000\n.", "memo is out of range"),

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from sb3_cases import BOX, MODELS, PPO, DummyVecEnv, Model, Noise, Saved, VecNormalize, save_model
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data import OneHot
 
 from recipes.export_sb3 import export
 from torchrl_priors.artifacts import ArtifactError, load_prior, load_sb3_prior, save_prior
@@ -149,6 +150,15 @@ class TestConversion:
         torch.testing.assert_close(normal.mean, squashed.deterministic_sample, **TOLERANCE)
         assert (normal.stddev == 0.3).all()
 
+    def test_discrete_advice_can_be_one_hot(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        path, batch = saved("ppo_discrete").path, batch_of(observations(MODELS["ppo_discrete"], 20))
+        save_prior(tmp_path / "teacher", load_sb3_prior(path, one_hot=True), env_id="Noise-v0")
+        prior = load_prior(tmp_path / "teacher", observation_spec=3, action_spec=OneHot(5))
+        indices = load_sb3_prior(path).get_dist(batch).sample()
+        batch["action"] = nn.functional.one_hot(indices, 5)
+        expected = load_sb3_prior(path).log_prob(batch.clone().set("action", indices))
+        torch.testing.assert_close(prior.log_prob(batch), expected)
+
     @pytest.mark.usefixtures("without_torchrls_groups")
     def test_the_command_writes_a_teacher(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
         model = saved("ppo")
@@ -166,6 +176,21 @@ class TestConversion:
         with pytest.raises(ArtifactError, match="policy of Noise-v0"):
             load_prior(out, env_id="Hopper-v5")
 
+    @pytest.mark.usefixtures("without_torchrls_groups")
+    def test_the_command_writes_no_teacher_that_a_gaussian_student_cannot_learn_from(
+        self, saved: Callable[[str], Saved], tmp_path: Path
+    ) -> None:
+        overrides = [f"model={saved('sac').path}", "env_id=Noise-v0", f"out={tmp_path / 'teacher.safetensors'}"]
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            without, given = (compose("export_sb3", overrides + more) for more in ([], ["std=0.1"]))
+        with pytest.raises(ValueError, match=r"std=null: .* squashed"):
+            export(without)
+        assert not list(tmp_path.iterdir())
+        export(given)
+        assert load_prior(tmp_path / "teacher.safetensors").get_dist(batch_of(observations(MODELS["sac"], 1))).stddev[
+            0, 0
+        ] == pytest.approx(0.1)
+
 
 class MyPolicy(PPO.policy_aliases["MlpPolicy"]):
     pass
@@ -180,7 +205,7 @@ class TestRefusals:
             ({"actions": spaces.MultiBinary(2)}, "MlpPolicy", {}, "actions are a MultiBinary space"),
             ({"observations": spaces.Discrete(3)}, "MlpPolicy", {}, "observations are a Discrete space"),
             ({"observations": spaces.Dict(a=BOX)}, "MultiInputPolicy", {}, "observations are a Dict space"),
-            ({}, MyPolicy, {}, "policy class is one of test_sb3"),
+            ({}, MyPolicy, {}, "policy class is one of test_sb3, and only those of PPO, A2C, SAC and TD3"),
             ({}, "MlpPolicy", {"policy_kwargs": {"activation_fn": nn.Hardtanh}}, "Hardtanh"),
         ],
     )
@@ -199,6 +224,14 @@ class TestRefusals:
             load_sb3_prior(saved("ppo_discrete").path, std=0.1)
         with pytest.raises(ValueError, match="contradicts the file, whose policy has 'elu'"):
             load_sb3_prior(saved("a2c").path, activation="relu")
+        with pytest.raises(ValueError, match="contradicts the file, whose policy has 'tanh'"):
+            load_sb3_prior(saved("ppo").path, activation="relu")  # the file names none
+        load_sb3_prior(saved("ppo").path, activation="tanh")
+        with pytest.raises(ValueError, match="one_hot=True is of no use"):
+            load_sb3_prior(saved("ppo").path, one_hot=True)
+        with pytest.raises(ValueError, match=r"one for each of 2 dimensions .* got shape \(7,\)"):
+            load_sb3_prior(saved("ppo").path, std=torch.ones(7))
+        load_sb3_prior(saved("ppo").path, std=torch.ones(2))
         with pytest.raises(ValueError, match="Unknown activation"):
             load_sb3_prior(saved("ppo").path, activation="sin")
         with pytest.raises(ArtifactError, match=r"statistics of observations \(3,\)"):
@@ -215,10 +248,18 @@ class TestRefusals:
             (("policy_net.2.", "policy_net.3."), r"not a plain stack of linear"),
             (("value_net.weight", "gate.weight"), r"not known: gate\.weight"),
             (("action_net.", "act."), r"lacks action_net\.weight"),
+            (("value_net.weight", "\x1b[2J"), r"not known: \\x1b\[2J\."),
         ):
             path = rewrite(saved("a2c").path, tmp_path / "model.zip", weights=lambda w, r=rename: renamed(w, *r))
             with pytest.raises(ArtifactError, match=match):
                 load_sb3_prior(path)
+
+    def test_another_algorithm_is_named(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        def rename(data: dict[str, Any]) -> dict[str, Any]:
+            return {**data, "policy_class": {**data["policy_class"], "__module__": "stable_baselines3.dqn.policies"}}
+
+        with pytest.raises(ArtifactError, match=r"is one of stable_baselines3\.dqn\.policies, and only those of PPO"):
+            load_sb3_prior(rewrite(saved("a2c").path, tmp_path / "model.zip", data=rename))
 
 
 def renamed(weights: dict[str, Any], old: str, new: str) -> dict[str, Any]:

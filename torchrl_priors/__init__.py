@@ -1,5 +1,6 @@
 """Soft action priors for TorchRL: learn from a teacher that may be wrong."""
 
+from torchrl_priors.artifacts import load_prior, load_sb3_prior, save_prior
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
 from torchrl_priors.hooks import PriorShaping
@@ -69,12 +70,15 @@ __all__ = [
     "cross_entropy",
     "get_method",
     "iqm",
+    "load_prior",
+    "load_sb3_prior",
     "mean_confidence_interval",
     "multi_teacher_transforms",
     "performance_profile",
     "probability_of_improvement",
     "register_configs",
     "sample_worlds",
+    "save_prior",
     "stratified_bootstrap_ci",
 ]
 

@@ -115,7 +115,7 @@ def _safetensors() -> ModuleType:
     try:
         import safetensors.torch
     except ImportError as error:
-        raise ImportError("Policy files need safetensors: pip install 'torchrl-priors[mujoco]'.") from error
+        raise ImportError("Policy files need safetensors: pip install 'torchrl-priors[artifacts]'.") from error
     return safetensors
 
 

@@ -9,7 +9,7 @@ from torchrl_priors.artifacts.errors import InertPickleError
 
 __all__ = ["check_program"]
 
-_MAX_STEPS = 1 << 18  # of the program; the statistics of a thousand environments have fewer
+_MAX_STEPS = 1 << 17  # of the program: the statistics of hundreds of environments have fewer
 _MAX_DEPTH = 32  # of tuples in tuples, and
 _MAX_ENTRIES = 1000  # what they have in all: a shape, or the state of an array, has a few
 

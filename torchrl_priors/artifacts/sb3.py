@@ -117,11 +117,11 @@ def load_sb3_prior(
         parts.check_all_taken()
         _check_sizes(layers, checkpoint)
         check_values(nn.Sequential(*layers))
+        if squashed and std is None:
+            low, high = _bounds(checkpoint)
+            kwargs |= {"distribution_class": TanhNormal, "distribution_kwargs": {"low": low, "high": high}}
     except ArtifactError as error:
         raise ArtifactError(f"{path} can't be used as a Stable-Baselines3 policy: {error}.") from error
-    if squashed and std is None:
-        low, high = _bounds(checkpoint)
-        kwargs |= {"distribution_class": TanhNormal, "distribution_kwargs": {"low": low, "high": high}}
     if one_hot:
         kwargs["distribution_class"] = OneHotCategorical
     output = "logits" if discrete else "mean_std" if std is None else "mean"
