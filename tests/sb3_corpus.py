@@ -57,7 +57,7 @@ def weights(good: dict[str, torch.Tensor]) -> Iterator[tuple[str, bytes]]:
         "expanded": torch.zeros(1).expand(1 << 16, 1 << 20),
         "meta": torch.empty(value.shape, device="meta"),
         "sparse": value.to_sparse(),
-        "sparse and huge": torch.sparse_coo_tensor(size=(1 << 20, 1 << 20)),
+        "sparse and huge": torch.sparse_coo_tensor(size=(1 << 20, 1 << 20), check_invariants=True),
         "nan": torch.full_like(value, math.nan),
         "inf": torch.full_like(value, math.inf),
         "double": value.double(),
