@@ -160,6 +160,26 @@ def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
     assert "finished already" in capsys.readouterr().out
 
 
+def test_resume_false_starts_anew_and_forgets_the_old_checkpoints(tmp_path, monkeypatch, capsys):
+    run(tmp_path)
+    whole = (tmp_path / "eval.csv").read_bytes()
+    interrupt(monkeypatch, tmp_path, 128, "resume=false")
+    assert [path.name[-3:] for path in (tmp_path / "checkpoints").iterdir()] == ["064"]
+    run(tmp_path)
+    assert (tmp_path / "eval.csv").read_bytes() == whole
+    run(tmp_path, "resume=false")
+    assert "finished already" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["[]", "x{"])
+def test_a_damaged_status_is_named_and_kept(content, tmp_path):
+    run(tmp_path, "total_frames=64")
+    (tmp_path / "status.json").write_text(content)
+    with pytest.raises(SystemExit, match=r"status\.json is damaged"):
+        run(tmp_path, "total_frames=64")
+    assert (tmp_path / "status.json").read_text() == content
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
