@@ -13,7 +13,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import refuse_unknown_keys
+from recipes.checks import check_keys, require_file_name
 from torchrl_priors.artifacts import load_sb3_prior, save_prior
 
 
@@ -34,7 +34,8 @@ ConfigStore.instance().store(group="schema", name="export_sb3", node=ExportConfi
 
 def export(cfg: ExportConfig) -> None:
     """Convert the policy, and write it."""
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
+    require_file_name(cfg.out)
     prior = load_sb3_prior(cfg.model, vecnormalize=cfg.vecnormalize, std=cfg.std, activation=cfg.activation)
     files = {"model": cfg.model, "vecnormalize": cfg.vecnormalize}
     training = {name: None if path is None else Path(path).name for name, path in files.items()}

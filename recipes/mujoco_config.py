@@ -10,7 +10,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import refuse_unknown_keys, require_compiler
+from recipes.checks import check_keys, require_compiler
 from recipes.loggers import LOGGERS, require_logger
 from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior
@@ -129,7 +129,7 @@ def check(cfg: MujocoConfig) -> None:
         ValueError: names the key, its value and what was expected.
         ImportError: names the extra that is needed.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
     get_method(cfg.method)
     if cfg.method != "none":
         _require(
