@@ -19,6 +19,7 @@ from tensordict import TensorDict
 
 pytest.importorskip("mujoco")
 from recipes import mujoco as recipe
+from recipes import mujoco_config
 from recipes.export_best import ExportConfig, export
 from torchrl_priors.methods import METHODS
 
@@ -228,6 +229,17 @@ def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path)
             run(out, f"env={env}", "method=e2r", f"prior.path={path}", "total_frames=256")
         assert message in str(error.value)
         assert not out.exists()
+
+
+def test_a_teacher_that_no_gaussian_student_can_learn_from_is_refused(teacher, tmp_path, monkeypatch):
+    def refuse(student, prior):
+        assert (student.event_shape, prior.event_shape) == ((3,), (3,))
+        raise ValueError("its actions are bounded")
+
+    monkeypatch.setattr(mujoco_config, "cross_entropy", refuse)
+    with pytest.raises(SystemExit, match=r"^Error: prior\.path=.*teacher.*: its actions are bounded"):
+        run(tmp_path / "out", "method=er", f"prior.path={teacher}")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_missing_compiler_is_told_of_before_training(tmp_path, monkeypatch):
