@@ -16,11 +16,14 @@ import pytest
 import torch
 from mujoco_cases import ROOT, TINY, config, interrupt, run
 from tensordict import TensorDict
+from torch import nn
+from torchrl.modules import TanhNormal
 
 pytest.importorskip("mujoco")
 from recipes import mujoco as recipe
-from recipes import mujoco_config
 from recipes.export_best import ExportConfig, export
+from torchrl_priors import ModulePrior
+from torchrl_priors.artifacts import save_prior
 from torchrl_priors.methods import METHODS
 
 
@@ -231,13 +234,14 @@ def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path)
         assert not out.exists()
 
 
-def test_a_teacher_that_no_gaussian_student_can_learn_from_is_refused(teacher, tmp_path, monkeypatch):
-    def refuse(student, prior):
-        assert (student.event_shape, prior.event_shape) == ((3,), (3,))
-        raise ValueError("its actions are bounded")
-
-    monkeypatch.setattr(mujoco_config, "cross_entropy", refuse)
-    with pytest.raises(SystemExit, match=r"^Error: prior\.path=.*teacher.*: its actions are bounded"):
+def test_a_teacher_of_bounded_actions_is_refused_as_students_are_gaussian(tmp_path):
+    teacher = tmp_path / "bounded.safetensors"
+    save_prior(
+        teacher, ModulePrior(nn.Linear(11, 3), "mean", std=0.5, distribution_class=TanhNormal), env_id="Hopper-v5"
+    )
+    with pytest.raises(
+        SystemExit, match=r"^Error: prior\.path=.*bounded\.safetensors: no student .* can learn from it"
+    ):
         run(tmp_path / "out", "method=er", f"prior.path={teacher}")
     assert not (tmp_path / "out").exists()
 
