@@ -1,24 +1,27 @@
-"""What every recipe checks before it works: keys that nobody reads, and a C++ compiler where one is needed."""
+"""What recipes check before they work: their keys, the file to write, and a C++ compiler where one is needed."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
-__all__ = ["refuse_unknown_keys", "require_compiler"]
+__all__ = ["check_keys", "require_compiler", "require_file_name"]
 
 
-def refuse_unknown_keys(cfg: Any) -> None:
-    """Refuse what ``+key=value`` appended to a recipe's configuration: Hydra takes it, and nothing would read it.
+def check_keys(cfg: Any) -> None:
+    """Refuse keys that ``+key=value`` appended, which Hydra takes and nothing would read, and keys without a value.
 
     Raises:
         ValueError: names the keys.
     """
     if unknown := list(_unknown(cfg, "")):
         raise ValueError(f"{', '.join(unknown)}: there is no such key.")
+    if missing := sorted(OmegaConf.missing_keys(cfg)) if OmegaConf.is_config(cfg) else ():
+        raise ValueError(f"{', '.join(f'{key}=' for key in missing)}: expected a value (see --help), none was given.")
 
 
 def _unknown(cfg: Any, prefix: str) -> Iterator[str]:
@@ -30,6 +33,16 @@ def _unknown(cfg: Any, prefix: str) -> Iterator[str]:
                 yield f"{prefix}{key}"
             elif not OmegaConf.is_missing(cfg, key) and OmegaConf.is_config(cfg[key]):
                 yield from _unknown(cfg[key], f"{prefix}{key}.")
+
+
+def require_file_name(out: str) -> None:
+    """Refuse a folder where the name of a file is expected.
+
+    Raises:
+        ValueError: says so.
+    """
+    if Path(out).is_dir():
+        raise ValueError(f"out={out}: this is a folder, expected the name of the file to write.")
 
 
 def require_compiler(compiled: bool, device: str = "cpu") -> None:

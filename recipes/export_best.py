@@ -14,7 +14,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import refuse_unknown_keys
+from recipes.checks import check_keys, require_file_name
 from recipes.report_runs import Run, find, read
 from torchrl_priors.artifacts import read_manifest
 from torchrl_priors.artifacts.format import write_atomically
@@ -44,7 +44,8 @@ def export(cfg: ExportConfig) -> None:
     Raises:
         ValueError: no finished run of that method and environment, or its policy is damaged or of another one.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
+    require_file_name(cfg.out)
     runs, left_out = read(find(cfg.runs))
     runs = [run for run in runs if run.env == cfg.env_id and run.method == cfg.method]
     if not runs:

@@ -14,7 +14,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from torchrl.modules import TanhNormal
 
-from recipes.checks import refuse_unknown_keys
+from recipes.checks import check_keys, require_file_name
 from torchrl_priors.artifacts import load_sb3_prior, save_prior
 from torchrl_priors.priors.mixture import distribution_class
 
@@ -40,7 +40,8 @@ def export(cfg: ExportConfig) -> None:
     Raises:
         ValueError: see :func:`load_sb3_prior`; or it is one that the students of ``recipes.mujoco`` can't learn from.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
+    require_file_name(cfg.out)
     prior = load_sb3_prior(cfg.model, vecnormalize=cfg.vecnormalize, std=cfg.std, activation=cfg.activation)
     if distribution_class(prior) is TanhNormal:
         raise ValueError(

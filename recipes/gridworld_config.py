@@ -9,7 +9,7 @@ import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import refuse_unknown_keys, require_compiler
+from recipes.checks import check_keys, require_compiler
 from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.methods import get_method
 from torchrl_priors.tabular.advice import parse_prior
@@ -115,7 +115,7 @@ def check(cfg: GridworldConfig) -> None:
     Raises:
         ValueError: names the key, its value and what was expected.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
     for key, names, parse in (("methods", cfg.methods, get_method), ("priors", cfg.priors, parse_prior)):
         _require(len(names) > 0, key, list(names), "at least one")
         _require(len(set(names)) == len(names), key, list(names), "no name twice")

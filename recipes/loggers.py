@@ -31,8 +31,8 @@ def require_logger(name: str) -> None:
 class RunLogger:
     """What a run sends to TensorBoard or Weights & Biases.
 
-    A run that continues goes on in the same log. What had been logged after its checkpoint comes again: TensorBoard is
-    told to drop the first copy; in Weights & Biases equal points lie on each other.
+    A run that continues, or starts anew, goes on in the same log. What had been logged after its checkpoint comes
+    again: TensorBoard is told to drop the first copy; in Weights & Biases equal points lie on each other.
 
     Args:
         name (str): ``"tensorboard"`` or ``"wandb"`` (``WANDB_MODE=offline`` keeps it on this machine).
@@ -48,10 +48,11 @@ class RunLogger:
         if name == "wandb":
             options["wandb_kwargs"] = {"project": "torchrl_priors", "id": identity, "config": config}
         self._name = name
+        continued = (folder / "log").exists()
         experiment = f"{folder.name}" if name == "wandb" else "log"
         log_dir = folder / "log" if name == "wandb" else folder
         self._logger = get_logger(name, logger_name=str(log_dir), experiment_name=experiment, **options)
-        if name == "tensorboard" and frames:
+        if name == "tensorboard" and continued:
             writer = self._logger.experiment
             writer.close()
             writer.purge_step = frames + 1  # the next file begins with it

@@ -7,16 +7,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
+from tensordict import TensorDict
 
-from recipes.checks import refuse_unknown_keys, require_compiler
+from recipes.checks import check_keys, require_compiler
 from recipes.loggers import LOGGERS, require_logger
 from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
 from torchrl_priors.methods import get_method
+from torchrl_priors.networks import make_actor
+from torchrl_priors.objectives import cross_entropy
 
 __all__ = ["MujocoConfig", "check"]
 
@@ -129,7 +133,7 @@ def check(cfg: MujocoConfig) -> None:
         ValueError: names the key, its value and what was expected.
         ImportError: names the extra that is needed.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
     get_method(cfg.method)
     if cfg.method != "none":
         _require(
@@ -236,9 +240,15 @@ def _check_prior(cfg: MujocoConfig, obs_dim: int, act_dim: int) -> None:
         )
     try:
         env_id = f"{cfg.env.id}-{cfg.env.version}"
-        load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
+        prior = load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
     except ArtifactError as error:
         raise ValueError(f"prior.path: {error}") from None
+    nothing = torch.zeros(1, obs_dim)
+    states = TensorDict(observation=nothing, observation_norm=nothing, batch_size=[1])
+    try:
+        cross_entropy(make_actor(obs_dim, act_dim).get_dist(states.copy()), prior.get_dist(states))
+    except (ValueError, NotImplementedError) as error:  # a teacher of bounded actions, say
+        raise ValueError(f"prior.path={path}: no student of this recipe can learn from it: {error}") from None
     if cfg.prior.degrade == "structural":
         last = obs_dim - 1
         _require(0 <= cfg.prior.feature <= last, "prior.feature", cfg.prior.feature, f"a number from 0 to {last}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shutil
 import traceback
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +22,7 @@ from tqdm import tqdm
 from recipes.launchers import fail, in_sweep
 from recipes.loggers import RunLogger
 from recipes.mujoco_config import MujocoConfig
-from recipes.runs import RunFolder, digest, refuse_foreign
+from recipes.runs import RunFolder, digest, read_json, refuse_foreign
 from recipes.schedule_config import without_idle
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors.evaluation import Evaluation
@@ -61,7 +62,7 @@ class Run:
     def status(self) -> dict[str, Any]:
         """What is known of the run: its state (``running``, ``finished`` or ``failed``), frames, and error if any."""
         path = self.folder.path / "status.json"
-        return json.loads(path.read_text()) if path.exists() else {"state": "new", "frames": 0}
+        return read_json(path) if path.exists() else {"state": "new", "frames": 0}
 
     def set_status(self, state: str, **more: Any) -> None:
         """Write ``status.json``."""
@@ -69,10 +70,12 @@ class Run:
         self.folder.write("status.json", lambda path: path.write_text(text))
 
     def register(self, **components: Any) -> None:
-        """What a checkpoint consists of; loads the last one, if the run is to be resumed."""
+        """What a checkpoint consists of; loads the last one if the run is to be resumed, removes them all if not."""
         self.frames = 0
         self.collector = components["collector"]
         self.checkpoint = Checkpoint(**components, rng=GlobalRNGState())
+        if not self.cfg.resume and self.rotation.directory.exists():
+            shutil.rmtree(self.rotation.directory)
         if self.cfg.resume and (latest := self.rotation.latest()) is not None:
             refuse_foreign(latest)
             self.rotation.load_latest(self.checkpoint)
@@ -180,10 +183,11 @@ def supervise(
     torch.set_num_threads(1)
     try:
         check(cfg)
-        run = Run(cfg)
-        if run.status["state"] == "finished":
-            print(f"{run.folder.path}: finished already", flush=True)
+        opened = Run(cfg)
+        if opened.status.get("state") == "finished" and cfg.resume:
+            print(f"{opened.folder.path}: finished already", flush=True)
             return None
+        run = opened  # from here on there is a status to write
         train(cfg, run)
     except Exception as error:
         if run is not None:

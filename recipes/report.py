@@ -2,8 +2,8 @@
 
     python -m recipes.report runs=<folder, glob or list> [out=<folder>] [key=value ...]
 
-Runs are those of ``recipes.mujoco`` or studies of ``recipes.gridworld``. A run that isn't finished, or whose data have
-holes, is named and in no table. See ``conf/report.yaml`` for the keys.
+Runs are those of ``recipes.mujoco`` or studies of ``recipes.gridworld``. A run or study that isn't finished, or whose
+data have holes, is named and in no table. See ``conf/report.yaml`` for the keys.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from recipes import report_gridworld
 from recipes.report_config import ReportConfig, check
 from recipes.report_figures import TRAINING, curve_table, figures
 from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
-from recipes.report_runs import LeftOut, find, is_gridworld, name_groups, read, without_misfits
+from recipes.report_runs import LeftOut, Run, find, is_gridworld, name_groups, read, short_paths, without_misfits
 from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.plots import save_figure
 
@@ -49,32 +49,51 @@ def report(cfg: ReportConfig) -> Path:
     check(cfg)
     runs: Any = OmegaConf.to_container(cfg.runs) if OmegaConf.is_config(cfg.runs) else cfg.runs
     folders = find(runs)
-    studies = [folder for folder in folders if is_gridworld(folder)]
     out = Path(cfg.out)
-    others = [folder for folder in folders if folder not in studies]
-    if not others:
-        pages = [report_gridworld.write(folder, out / folder.name if len(studies) > 1 else out) for folder in studies]
-        return pages[0] if len(pages) == 1 else _index(out, pages)
-    pages = [report_gridworld.write(folder, out / folder.name) for folder in studies]
-    page = _report_runs(cfg, runs, others, out)
-    return _index(out, [page, *pages]) if pages else page
+    studies = {folder.resolve(): folder for folder in folders if is_gridworld(folder)}
+    if len(folders) == len(studies) == 1:
+        return report_gridworld.write(folders[0], out)
+    usable, left_out = _usable(cfg, [folder for folder in folders if folder.resolve() not in studies])
+    pages = []
+    for path, name in sorted(short_paths(studies).items()):
+        try:
+            pages.append(report_gridworld.write(studies[path], out / name))
+        except ValueError as error:
+            left_out.append(LeftOut(studies[path], str(error)))
+    for entry in left_out:
+        print(f"Left out: {entry.path}: {entry.reason}", file=sys.stderr)
+    if not usable and not pages:
+        raise ValueError(f"runs={runs}: none of the {len(left_out)} runs can be used (see above).")
+    if usable:
+        pages.insert(0, _report_runs(cfg, runs, usable, left_out, out))
+    return _index(out, pages, left_out) if studies else pages[0]
 
 
-def _index(out: Path, pages: Sequence[Path]) -> Path:
-    links = "\n".join(f"- [{page.parent.name}]({page.relative_to(out)})" for page in pages)
-    return write_text(out / "README.md", f"# Reports\n\n{links}\n")
-
-
-def _report_runs(cfg: ReportConfig, given: str | list[str], folders: Sequence[Path], out: Path) -> Path:
+def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
     found, left_out = read(folders)
     name_groups(found, cfg)
     usable, misfits = without_misfits(found)
-    left_out += misfits
-    for entry in left_out:
-        print(f"Left out: {entry.path}: {entry.reason}", file=sys.stderr)
-    if not usable:
-        raise ValueError(f"runs={given}: none of the {len(left_out)} runs can be used (see above).")
+    return usable, left_out + misfits
 
+
+def _index(out: Path, pages: Sequence[Path], left_out: Sequence[LeftOut]) -> Path:
+    links = [page.relative_to(out) for page in pages]
+    parts = ["# Reports", "\n".join(f"- [{link.parent if link.parent.name else 'runs'}]({link})" for link in links)]
+    parts += _left_out(left_out)
+    return write_text(out / "README.md", "\n\n".join(parts) + "\n")
+
+
+def _left_out(entries: Sequence[LeftOut]) -> list[str]:
+    if not entries:
+        return []
+    rows = [(f"`{entry.path}`", entry.reason) for entry in entries]
+    heading = f"**Left out** ({len(entries)}), in no number and no figure here."
+    return [heading, table(["run", "why"], rows, text_columns=2)]
+
+
+def _report_runs(
+    cfg: ReportConfig, given: str | list[str], usable: Sequence[Run], left_out: Sequence[LeftOut], out: Path
+) -> Path:
     study = Study(usable, cfg)
     tables = {
         "returns": return_table(study),
@@ -115,11 +134,7 @@ def _page(
     seeds = used.groupby(["env", "prior", "method"], sort=False)["seed"].agg(list).reset_index()
     parts.append(pivot(seeds.replace({"prior": {"": "-"}}), ["env", "prior"], lambda row: _seeds(row["seed"])))
     parts += [f"> {note}" for note in study.notes]
-    if left_out:
-        rows = [(f"`{entry.path}`", entry.reason) for entry in left_out]
-        parts.append(f"**Left out** ({len(left_out)}), in no number and no figure here.")
-        parts.append(table(["run", "why"], rows, text_columns=2))
-
+    parts += _left_out(left_out)
     parts += ["## Returns", _figure("return_curves"), "Last evaluation, IQM over seeds:"]
     returns = tables["returns"].replace({"prior": {"": "-"}})
     last = pivot(

@@ -8,7 +8,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import refuse_unknown_keys
+from recipes.checks import check_keys
 
 __all__ = ["Bootstrap", "ReportConfig", "check"]
 
@@ -50,7 +50,7 @@ def check(cfg: ReportConfig) -> None:
     Raises:
         ValueError: names the key, its value and what was expected.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
     if cfg.pairing not in ("seed", "mean"):
         raise ValueError(f"pairing={cfg.pairing}: expected seed or mean.")
     for key, choices in cfg.only_for.items():

@@ -25,9 +25,9 @@ def write(folder: Path, out: Path) -> Path:
     """Write ``report.md`` and its figures into ``out``; the path of the page.
 
     Raises:
-        ValueError: a table is missing, damaged or has holes; the message names it.
+        ValueError: a table or the configuration is missing, damaged or has holes; the message names its file.
     """
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    config = _config(folder / "config.yaml")
     tables = {name: _table(folder / f"{name}.csv", optional=name not in _TABLES[:2]) for name in _TABLES}
     for name, figure in _figures(tables).items():
         save_figure(figure, out / name)
@@ -37,6 +37,14 @@ def write(folder: Path, out: Path) -> Path:
     return write_text(out / "report.md", _page(folder, out, config, tables))
 
 
+def _config(file: Path) -> dict[str, Any]:
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.load(file))
+        return {key: config[key] for key in ("worlds", "seed", "td_error")}
+    except Exception as error:  # whatever reading a damaged file ends in
+        raise ValueError(f"{file} cannot be used ({type(error).__name__}: {error}).") from None
+
+
 def _table(file: Path, *, optional: bool) -> pd.DataFrame:
     if optional and not file.exists():
         return pd.DataFrame()
@@ -44,7 +52,7 @@ def _table(file: Path, *, optional: bool) -> pd.DataFrame:
         frame = pd.read_csv(file)
     except FileNotFoundError:
         raise ValueError(f"{file} is missing: is the study finished?") from None
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise ValueError(f"{file} is damaged ({error}).") from None
     holes = [name for name in frame if not name.startswith("paper_") and frame[name].isna().any()]
     if holes and not optional:

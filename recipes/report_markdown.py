@@ -47,7 +47,7 @@ def plus_minus(mean: float, spread: float, digits: int = 2) -> str:
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]], text_columns: int = 1) -> str:
-    """A Markdown table: what is text on the left, what is numbers on the right.
+    """A Markdown table: what is text on the left, what is numbers on the right, a cell's lines as one.
 
     >>> print(table(["env", "return"], [["Hopper", "1 020"]]))
     | env | return |
@@ -55,8 +55,12 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]], text_columns
     | Hopper | 1 020 |
     """
     rule = "|".join(":--" if index < text_columns else "--:" for index in range(len(columns)))
-    lines = [[str(cell).replace("|", "\\|") for cell in row] for row in (columns, *rows)]
+    lines = [[_cell(cell) for cell in row] for row in (columns, *rows)]
     return "\n".join([f"| {' | '.join(lines[0])} |", f"|{rule}|", *(f"| {' | '.join(line)} |" for line in lines[1:])])
+
+
+def _cell(content: object) -> str:
+    return " ".join(line.strip() for line in str(content).splitlines()).replace("|", "\\|")
 
 
 def pivot(frame: pd.DataFrame, index: Sequence[str], cell: Callable[[pd.Series], str], columns: str = "method") -> str:

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from recipes.report_config import ReportConfig
 from torchrl_priors.methods import METHODS, get_method
 
-__all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "without_misfits"]
+__all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "short_paths", "without_misfits"]
 
 
 @dataclass
@@ -86,7 +86,7 @@ def is_gridworld(folder: Path) -> bool:
     if (folder / "area_ratio.csv").exists():
         return True
     config = folder / "config.yaml"
-    return not (folder / "status.json").exists() and config.exists() and "\nworlds:" in f"\n{config.read_text()}"
+    return not (folder / "status.json").exists() and config.is_file() and b"\nworlds:" in b"\n" + config.read_bytes()
 
 
 def read(folders: Iterable[Path]) -> tuple[list[Run], list[LeftOut]]:
@@ -186,10 +186,13 @@ def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
     """Name each run's prior and method, and the settings that runs of one kind in one environment differ in."""
     taught = [run for run in runs if run.degrade]
-    files = _short_paths({str(run.settings.get("prior.path")) for run in taught})
+    files = short_paths(Path(str(run.settings.get("prior.path"))).with_suffix("") for run in taught)
     for run, told in zip(taught, _differences(taught, lambda run: run.degrade, _prior_settings), strict=True):
         kind = f"degraded teacher ({run.degrade})" if run.degraded else "teacher"
-        settings = (files[str(value)] if key == "path" else f"{key}={_short(value)}" for key, value in told.items())
+        settings = (
+            files[Path(str(value)).with_suffix("")] if key == "path" else f"{key}={_short(value)}"
+            for key, value in told.items()
+        )
         run.prior = ", ".join([kind, *settings])
     differences = _differences(runs, lambda run: run.method, lambda run: _method_settings(run, cfg))
     for run, told in zip(runs, differences, strict=True):
@@ -199,13 +202,13 @@ def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
         run.label = cfg.rename.get(label, label)
 
 
-def _short_paths(paths: set[str]) -> dict[str, str]:
-    """Names of files by as few of their last folders as tell them apart."""
-    parts = {path: Path(path).with_suffix("").parts for path in paths}
+def short_paths(paths: Iterable[Path]) -> dict[Path, str]:
+    """Names of files or folders by as few of their last folders as tell them apart."""
+    different = set(paths)
     depth = 1
-    while len({names[-depth:] for names in parts.values()}) < len(set(parts.values())):
+    while len({path.parts[-depth:] for path in different}) < len(different):
         depth += 1
-    return {path: "/".join(names[-depth:]) for path, names in parts.items()}
+    return {path: "/".join(path.parts[-depth:]) for path in different}
 
 
 def _differences(

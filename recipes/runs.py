@@ -1,4 +1,4 @@
-"""A run's folder: its resolved configuration, and files that are either whole or not there."""
+"""A run's folder: its resolved configuration, files that are either whole or not there, one process at a time."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import hashlib
 import json
 import os
 import shutil
+import sys
+import weakref
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +15,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["RunFolder", "digest", "refuse_foreign"]
+if sys.platform != "win32":
+    import fcntl
+
+__all__ = ["RunFolder", "digest", "read_json", "refuse_foreign"]
 
 #: Temporary names: of :meth:`RunFolder.write`, of policies, and of TorchRL's checkpoints (being written or removed).
 _LEFTOVERS = (".[0-9]*.*", "*/.[0-9]*.*", ".*.partial", "checkpoints/.checkpoint-*")
@@ -39,6 +44,21 @@ def refuse_foreign(checkpoint: Path) -> None:
             )
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        ValueError: there is something else in it; the message names the file.
+    """
+    try:
+        content = json.loads(path.read_bytes())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: expected a JSON object ({error}).") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} is damaged: expected a JSON object, found {type(content).__name__}.")
+    return content
+
+
 def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in config.items():
@@ -49,6 +69,9 @@ def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 class RunFolder:
     """A folder for the results of one configuration, to be continued by the same configuration only.
 
+    While the object lives, other processes are kept out of the folder. Neither a child process nor a copy sent to one
+    holds the lock, and it ends with the process, however that does.
+
     Args:
         path (Path): created if needed.
         config (dict): everything that the results depend on, as plain values.
@@ -56,7 +79,8 @@ class RunFolder:
 
     Raises:
         OSError: the folder cannot be written.
-        ValueError: it holds results of another configuration; the message names what differs.
+        ValueError: it holds results of another configuration, and the message names what differs; or of something
+            else; or another process is at work in it.
     """
 
     def __init__(self, path: Path, config: dict[str, Any], text: str) -> None:
@@ -64,13 +88,19 @@ class RunFolder:
         stamp = path / "config.json"
         try:
             path.mkdir(parents=True, exist_ok=True)
-            if stamp.exists():
-                self._check_same(json.loads(stamp.read_text()), config)
+            known = stamp.exists()
+            if known:
+                self._check_same(read_json(stamp), config)
+            elif (path / "config.yaml").exists():
+                raise ValueError(f"out={path} holds a config.yaml that is not of this recipe: choose another folder.")
+            self._lock()
+            if known:
                 self._remove_leftovers()
-            self.write("config.yaml", lambda temporary: temporary.write_text(text))
+            # first what makes the folder this recipe's: it may be killed in between
             self.write(
                 "config.json", lambda temporary: temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
             )
+            self.write("config.yaml", lambda temporary: temporary.write_text(text))
         except OSError as error:
             raise OSError(f"Cannot write the results to out={path}: {error}") from error
 
@@ -86,6 +116,20 @@ class RunFolder:
                 f"out={self.path} holds results of another configuration ({'; '.join(changed)}): choose another "
                 "folder, or leave `out` to its default, which differs for each configuration."
             )
+
+    def _lock(self) -> None:
+        if sys.platform == "win32":
+            return
+        descriptor = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o666)  # never deleted: one file for all
+        weakref.finalize(self, os.close, descriptor)
+        try:
+            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock's, not inherited by children
+        except (BlockingIOError, PermissionError):
+            raise ValueError(
+                f"out={self.path}: another process is at work in this folder. Wait for it, end it, or choose another."
+            ) from None
+        except OSError:
+            pass  # a file system without locks
 
     def _remove_leftovers(self) -> None:
         """Remove what was being written when the process was killed."""

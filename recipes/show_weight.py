@@ -18,7 +18,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 from tqdm import tqdm
 
-from recipes.checks import refuse_unknown_keys
+from recipes.checks import check_keys
 from recipes.gridworld import student_config, world_sampler
 from recipes.report_runs import is_gridworld
 from torchrl_priors import plots
@@ -65,7 +65,7 @@ def show(cfg: ShowConfig) -> list[Path]:
         ValueError: there is no such run, or it has no learned weight, or a setting is out of range.
         OSError: something cannot be read or written.
     """
-    refuse_unknown_keys(cfg)
+    check_keys(cfg)
     folder = Path(cfg.run)
     if not (folder / "config.yaml").is_file():
         raise ValueError(f"run={folder}: no run or study is there (it would have a config.yaml).")
@@ -146,8 +146,6 @@ def _show_gridworld(cfg: ShowConfig, folder: Path, out: Path) -> list[Path]:
 def main(cfg: ShowConfig) -> None:
     """Show what a weight does."""
     try:
-        if OmegaConf.is_missing(cfg, "run"):
-            raise ValueError("run=: the folder of a study or a run is missing.")
         print("Written:", *(f"  {path}" for path in show(cfg)), sep="\n")
     except (ValueError, OSError, ImportError) as error:
         sys.exit(f"Error: {error}")

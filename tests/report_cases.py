@@ -8,14 +8,30 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+import recipes.report_config  # noqa: F401 (stores the schema)
 from torchrl_priors.methods import get_method
 
+ROOT = Path(__file__).parents[1]
 POINTS = np.arange(1, 21) * 50_000
 #: Return that a method ends with under a good and a bad prior, as a share of the environment's scale.
 LEVEL = {"none": (0.55, 0.55), "e2r": (0.95, 0.1), "ae2r": (0.75, 0.4), "kickstart": (0.9, 0.15), "aligned": (0.9, 0.5)}
 SCALE = {"HalfCheetah": 2600.0, "Hopper": 2400.0, "Walker2d": 2300.0, "Ant": 1500.0}
+
+
+def config(*overrides: str) -> Any:
+    """The configuration of a report, as the command line makes it."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("report", ["bootstrap.reps=50", *overrides])
+
+
+def spoil(run: Path, file: str, row: int, column: str, value: float) -> None:
+    """Change one number of a table."""
+    frame = pd.read_csv(run / file)
+    frame.loc[row, column] = value
+    frame.to_csv(run / file, index=False)
 
 
 def write_run(

@@ -16,10 +16,14 @@ import pytest
 import torch
 from mujoco_cases import ROOT, TINY, config, interrupt, run
 from tensordict import TensorDict
+from torch import nn
+from torchrl.modules import TanhNormal
 
 pytest.importorskip("mujoco")
 from recipes import mujoco as recipe
 from recipes.export_best import ExportConfig, export
+from torchrl_priors import ModulePrior
+from torchrl_priors.artifacts import save_prior
 from torchrl_priors.methods import METHODS
 
 
@@ -160,6 +164,26 @@ def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
     assert "finished already" in capsys.readouterr().out
 
 
+def test_resume_false_starts_anew_and_forgets_the_old_checkpoints(tmp_path, monkeypatch, capsys):
+    run(tmp_path)
+    whole = (tmp_path / "eval.csv").read_bytes()
+    interrupt(monkeypatch, tmp_path, 128, "resume=false")
+    assert [path.name[-3:] for path in (tmp_path / "checkpoints").iterdir()] == ["064"]
+    run(tmp_path)
+    assert (tmp_path / "eval.csv").read_bytes() == whole
+    run(tmp_path, "resume=false")
+    assert "finished already" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["[]", "x{"])
+def test_a_damaged_status_is_named_and_kept(content, tmp_path):
+    run(tmp_path, "total_frames=64")
+    (tmp_path / "status.json").write_text(content)
+    with pytest.raises(SystemExit, match=r"status\.json is damaged"):
+        run(tmp_path, "total_frames=64")
+    assert (tmp_path / "status.json").read_text() == content
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -208,6 +232,18 @@ def test_missing_foreign_and_mismatching_teachers_are_refused(teacher, tmp_path)
             run(out, f"env={env}", "method=e2r", f"prior.path={path}", "total_frames=256")
         assert message in str(error.value)
         assert not out.exists()
+
+
+def test_a_teacher_of_bounded_actions_is_refused_as_students_are_gaussian(tmp_path):
+    teacher = tmp_path / "bounded.safetensors"
+    save_prior(
+        teacher, ModulePrior(nn.Linear(11, 3), "mean", std=0.5, distribution_class=TanhNormal), env_id="Hopper-v5"
+    )
+    with pytest.raises(
+        SystemExit, match=r"^Error: prior\.path=.*bounded\.safetensors: no student .* can learn from it"
+    ):
+        run(tmp_path / "out", "method=er", f"prior.path={teacher}")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_missing_compiler_is_told_of_before_training(tmp_path, monkeypatch):

@@ -18,10 +18,11 @@ def teacher(tmp_path_factory):
     return run(tmp_path_factory.mktemp("teacher"), "total_frames=64") / "policy.safetensors"
 
 
-def test_tensorboard_has_every_point_once_although_the_run_was_interrupted(teacher, tmp_path, monkeypatch):
+@pytest.mark.parametrize("interval", [128, 256])  # after the checkpoint at 128, or before there is one
+def test_tensorboard_has_every_point_once_although_the_run_was_interrupted(teacher, tmp_path, monkeypatch, interval):
     events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    options = ["logger=tensorboard", "method=ae2r", f"prior.path={teacher}", "checkpoint.interval=128"]
-    interrupt(monkeypatch, tmp_path, 192, *options)  # after the checkpoint at 128: 192 is logged twice
+    options = ["logger=tensorboard", "method=ae2r", f"prior.path={teacher}", f"checkpoint.interval={interval}"]
+    interrupt(monkeypatch, tmp_path, 192, *options)  # 192 is logged twice
     run(tmp_path, *options)
     found = events.EventAccumulator(str(tmp_path / "log"), size_guidance={"scalars": 0, "histograms": 0}).Reload()
     for prefix, table in (("train", "metrics"), ("eval", "eval")):

@@ -7,28 +7,17 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
-from report_cases import POINTS, write_run, write_study
+from report_cases import POINTS, ROOT, config, spoil, write_run, write_study
 
-import recipes.report_config  # noqa: F401 (stores the schema)
 from recipes.report import report
 from recipes.report_markdown import number, table
 from recipes.report_runs import find, name_groups, read, without_misfits
 from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.metrics import iqm
-
-ROOT = Path(__file__).parents[1]
-GRIDWORLD = ROOT / "results" / "gridworld" / "original"
-
-
-def config(*overrides: str) -> Any:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("report", ["bootstrap.reps=50", *overrides])
 
 
 def study_of(root: Path, *overrides: str) -> Study:
@@ -46,12 +35,6 @@ def left_out_of(root: Path) -> dict[str, str]:
     runs, left_out = read(find(str(root)))
     name_groups(runs, cfg)
     return {entry.path.name: entry.reason for entry in left_out + without_misfits(runs)[1]}
-
-
-def spoil(run: Path, file: str, row: int, column: str, value: float) -> None:
-    frame = pd.read_csv(run / file)
-    frame.loc[row, column] = value
-    frame.to_csv(run / file, index=False)
 
 
 def test_a_report_has_every_table_and_figure_and_names_what_it_left_out(tmp_path: Path) -> None:
@@ -300,32 +283,6 @@ def test_nothing_but_unusable_runs_is_an_error_with_a_message_only(tmp_path: Pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_gridworld_study_is_rendered_from_its_tables(tmp_path: Path) -> None:
-    page = report(config(f"runs={GRIDWORLD}", f"out={tmp_path}"))
-    ratios = pd.read_csv(GRIDWORLD / "area_ratio.csv").set_index(["prior", "method"])
-    cell = f"{1000 * ratios.loc[('structural_10', 'ae2r'), 'iqm']:.0f} ("
-    (line,) = [line for line in page.read_text().splitlines() if line.startswith("| Structural, 10") and "[" in line]
-    assert cell in line
-    assert {"iqm.png", "learning_curves.png"} <= {file.name for file in tmp_path.iterdir()}
-
-
-def test_a_gridworld_table_with_a_hole_is_refused_by_name(tmp_path: Path) -> None:
-    folder = tmp_path / "study"
-    folder.mkdir()
-    for name in ("config.yaml", "area_ratio.csv", "curves.csv"):
-        (folder / name).write_bytes((GRIDWORLD / name).read_bytes())
-    spoil(folder, "curves.csv", 5, "mean", np.nan)
-    with pytest.raises(ValueError, match=r"curves\.csv.*mean"):
-        report(config(f"runs={folder}", f"out={tmp_path / 'out'}"))
-
-
-def test_studies_and_runs_together_get_a_page_each_and_an_index(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs" / "a")
-    index = report(config(f"runs=[{tmp_path / 'runs'},{GRIDWORLD}]", f"out={tmp_path / 'out'}")).read_text()
-    assert "original/report.md" in index
-    assert "(report.md)" in index
-
-
 def test_a_failed_run_gives_its_reason(tmp_path: Path) -> None:
     write_run(tmp_path / "a")
     run = write_run(tmp_path / "b", seed=1)
@@ -336,3 +293,7 @@ def test_a_failed_run_gives_its_reason(tmp_path: Path) -> None:
 def test_numbers_are_short_and_never_minus_zero() -> None:
     assert [number(value) for value in (1234567.8, -0.004, -1.5, float("nan"))] == ["1 234 568", "0.00", "-1.50", "-"]
     assert table(["a|b"], [["c"]]).splitlines()[0] == "| a\\|b |"
+
+
+def test_a_cell_of_many_lines_stays_one_row() -> None:
+    assert table(["why"], [["a | b\n  c\n"]]).splitlines()[2:] == ["| a \\| b c |"]

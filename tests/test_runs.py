@@ -69,6 +69,78 @@ def test_another_configuration_is_refused_by_what_differs_and_changes_nothing(tm
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("config.yaml", "a: 1", "config.yaml that is not of this recipe"),
+        ("config.json", "[1]", r"config\.json is damaged: expected a JSON object, found list"),
+        ("config.json", "x{", r"config\.json is damaged: expected a JSON object"),
+        ("config.json", "\N{DEGREE SIGN}".encode("latin-1"), r"config\.json is damaged"),
+    ],
+)
+def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path, file, content, message):
+    (tmp_path / file).write_bytes(content if isinstance(content, bytes) else content.encode())
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        RunFolder(tmp_path, CONFIG, "new")
+    assert contents(tmp_path) == before
+
+
+def test_a_folder_whose_first_file_only_was_written_is_continued(tmp_path, monkeypatch):
+    write = RunFolder.write
+
+    def killed(self, name, writer):
+        write(self, name, writer)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RunFolder, "write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        RunFolder(tmp_path, CONFIG, "text")
+    monkeypatch.undo()
+    assert (RunFolder(tmp_path, CONFIG, "text").path / "config.yaml").read_text() == "text"
+
+
+HOLDER = """
+import os, pickle, sys, time
+from pathlib import Path
+from recipes.runs import RunFolder
+
+folder = RunFolder(Path(sys.argv[1]), {"worlds": 3}, "")
+copy = pickle.loads(pickle.dumps(folder))  # as for a worker
+del copy
+child = os.fork()
+if not child:
+    time.sleep(600)
+print(child, flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_folder_is_one_processs_until_it_dies_whatever_becomes_of_its_children(tmp_path):
+    command = [sys.executable, "-c", HOLDER, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        child = int(holder.stdout.readline())
+        with pytest.raises(ValueError, match="another process is at work"):
+            RunFolder(tmp_path, {"worlds": 3}, "")
+        holder.send_signal(signal.SIGKILL)
+        holder.wait()
+        assert alive(child)
+        try:
+            RunFolder(tmp_path, {"worlds": 3}, "")
+        finally:
+            os.kill(child, signal.SIGKILL)
+
+
+def test_a_file_system_without_locks_is_worked_on_without(tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError(95, "Operation not supported")
+
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setattr(fcntl, "lockf", refuse)
+    assert RunFolder(tmp_path, CONFIG, "").config == CONFIG
+
+
 def test_file_in_the_way_is_named_and_stays(tmp_path):
     (tmp_path / "out").write_text("precious")
     for path in (tmp_path / "out", tmp_path / "out" / "below"):
