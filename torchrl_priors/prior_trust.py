@@ -93,7 +93,7 @@ class PriorTrust(TensorDictModuleBase):
 
     Keyword Args:
         listen (int): frames to listen to. Defaults to 49152.
-        min_trust (float): in [0, 1]. Defaults to 0.7; calibrated, see ``results/mujoco``.
+        min_trust (float): in [0, 1]. Defaults to 0.65; calibrated, see ``results/mujoco``.
         num_random (int): tanh features beside the linear ones and the constant. Defaults to 64.
         prior_std (float): :math:`\tau`. Defaults to 0.05.
         seed (int): of the random features. Defaults to 0.
@@ -121,7 +121,7 @@ class PriorTrust(TensorDictModuleBase):
         num_features: int,
         *,
         listen: int = 49_152,
-        min_trust: float = 0.7,
+        min_trust: float = 0.65,
         num_random: int = 64,
         prior_std: float = 0.05,
         seed: int = 0,
