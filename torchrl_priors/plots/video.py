@@ -84,7 +84,7 @@ def _draw(frame: np.ndarray, weight: float, degraded: bool) -> Image.Image:
     label = strip * 3
     top, bottom = height + strip // 4, height + strip - strip // 4
     # Pillow's own font has no omega
-    font = ImageFont.truetype(Path(mpl.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size=strip * 0.58)
+    font = ImageFont.truetype(f"{mpl.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size=strip * 0.58)
     text = f"\N{GREEK SMALL LETTER OMEGA} {weight:.2f}"
     draw.text((strip // 3, height + strip // 2), text, fill="black", font=font, anchor="lm")
     right = width - strip // 3
