@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_priors.artifacts.errors import ArtifactError, differing
+from torchrl_priors.artifacts.errors import ArtifactError
+from torchrl_priors.artifacts.manifest import Sizes, check_against
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
 
@@ -43,7 +44,7 @@ def describe_network(network: nn.Module) -> Parts:
     )
 
 
-def sizes(network: nn.Module) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+def sizes(network: nn.Module) -> Sizes:
     """Names, shapes and types of what a network's ``state_dict`` holds."""
     return {name: (tuple(value.shape), value.dtype) for name, value in network.state_dict().items()}
 
@@ -60,16 +61,7 @@ def build_network(parts: Any, tensors: dict[str, Tensor]) -> nn.Module:
         ArtifactError: they do not fit each other, a tensor is not finite, or see :func:`check_values`.
     """
     network = _skeleton(parts)
-    expected = sizes(network)
-    if tensors.keys() != expected.keys():
-        names = differing(tensors.keys() ^ expected.keys())
-        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {names}")
-    for name, (shape, dtype) in expected.items():
-        value = tensors[name]
-        if tuple(value.shape) != shape or value.dtype is not dtype:
-            raise ArtifactError(f"{name} must be {dtype} of shape {shape}, got {value.dtype} of {tuple(value.shape)}")
-        if not value.isfinite().all():
-            raise ArtifactError(f"{name} is not finite: it has NaN or infinite entries")
+    check_against(tensors, sizes(network))
     network.load_state_dict(tensors, assign=True)
     check_values(network)
     return network

@@ -16,18 +16,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from torchrl_priors.artifacts.format import (
-    STATISTICS,
-    ArtifactError,
-    PolicyManifest,
-    PriorManifest,
-    check_tensors,
-    pack,
-    parse_manifest,
-    read,
-    read_file,
-    write_atomically,
-)
+from torchrl_priors.artifacts.errors import ArtifactError
+from torchrl_priors.artifacts.format import pack, read, read_file, write_atomically
+from torchrl_priors.artifacts.manifest import STATISTICS, PolicyManifest, PriorManifest, check_tensors, parse_manifest
 from torchrl_priors.artifacts.prior import build_prior
 from torchrl_priors.artifacts.spaces import check_spaces
 from torchrl_priors.collectors.running_norm import RunningNorm

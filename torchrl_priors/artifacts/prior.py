@@ -16,7 +16,8 @@ from torchrl.data import Bounded, OneHot
 from torchrl.modules import OneHotCategorical
 
 from torchrl_priors.artifacts.errors import ArtifactError, differing
-from torchrl_priors.artifacts.format import PRIOR, PriorManifest, pack, write_atomically
+from torchrl_priors.artifacts.format import PRIOR, pack, write_atomically
+from torchrl_priors.artifacts.manifest import PriorManifest
 from torchrl_priors.artifacts.network import build_network
 from torchrl_priors.artifacts.prior_parts import (
     Tensors,
