@@ -15,16 +15,17 @@ from tensordict.nn import (
     TensorDictParams,
     dispatch,
 )
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
+from torchrl_priors.functional import alignment, joint, prior_bonus, td_residual
 from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.priors import ActionPrior
 
+from .batch import check_option, keep_where, out_key, under_next, weight_regression
 from .cross_entropy import cross_entropy_and_kl, cross_entropy_of_advice
 
 __all__ = ["AE2RLoss"]
@@ -204,10 +205,10 @@ class AE2RLoss(LossModule):
     ):
         spec = get_method(method) if isinstance(method, str) else method
         weight_target = spec.weight_target if weight_target is None else weight_target
-        _check_option("td_error", td_error, ("original", "shaped"))
-        _check_option("weight_target", weight_target, ("td", "advantage", "none"))
-        _check_option("centering", centering, ("none", "prior", "policy"))
-        _check_option("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
+        check_option("td_error", td_error, ("original", "shaped"))
+        check_option("weight_target", weight_target, ("td", "advantage", "none"))
+        check_option("centering", centering, ("none", "prior", "policy"))
+        check_option("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
         if not hasattr(prior, "get_dist"):
             raise TypeError(f"The prior must be an ActionPrior or a policy, got {type(prior).__name__}.")
         if prior_in_batch and not isinstance(prior, ActionPrior):
@@ -275,9 +276,9 @@ class AE2RLoss(LossModule):
         ):
             self.register_coeff_buffer(name, value, device=device)
         if spec.adaptive and prior_weight is not None:
-            self.set_keys(prior_weight=_out_key(prior_weight, self.tensor_keys.prior_weight))
+            self.set_keys(prior_weight=out_key(prior_weight, self.tensor_keys.prior_weight))
         if self._has_critic and critic_network is not None:
-            self.set_keys(value=_out_key(critic_network, self.tensor_keys.value))
+            self.set_keys(value=out_key(critic_network, self.tensor_keys.value))
 
     def _set_network(self, name: str, network: TensorDictModule | None, apart_from: list[Tensor] | None = None) -> None:
         # one without parameters is used as it is: what it learns, in buffers, must reach it also after a move
@@ -311,8 +312,8 @@ class AE2RLoss(LossModule):
             if self.spec.adaptive:
                 shifted = self.weight_target == "td" and self.spec.bonus == "next"
                 keys += self.prior_weight.in_keys if self.spec.auxiliary or not shifted else []
-                keys += [_next(key) for key in self.prior_weight.in_keys] if shifted else []
-                where = _next if shifted else _root
+                keys += [under_next(key) for key in self.prior_weight.in_keys] if shifted else []
+                where = under_next if shifted else unravel_key
                 if self.weight_target != "none":
                     keys.append(where(names.prior_log_prob))
                 if self.weight_target == "td" and self.centering != "none":
@@ -320,10 +321,10 @@ class AE2RLoss(LossModule):
                 if self.weight_target == "advantage":
                     keys.append(names.raw_advantage)
                 if self._has_critic:
-                    keys += [*self.critic_network.in_keys, *(_next(key) for key in self.critic_network.in_keys)]
-                    keys.append(_next(names.reward))
+                    keys += [*self.critic_network.in_keys, *(under_next(key) for key in self.critic_network.in_keys)]
+                    keys.append(under_next(names.reward))
                 if self._has_critic or shifted:
-                    keys.append(_next(names.terminated))
+                    keys.append(under_next(names.terminated))
             self._in_keys = list(dict.fromkeys(keys))
         return self._in_keys
 
@@ -382,7 +383,7 @@ class AE2RLoss(LossModule):
                 losses["loss_prior_weight"] = self.weight_coeff * loss_weight
         if self.spec.auxiliary and auxiliary is not None:
             losses["loss_prior"] = self.aux_coeff * (auxiliary if weight is None else weight.detach() * auxiliary)
-        bonus = tensordict.get(_next(self.tensor_keys.prior_bonus), None)
+        bonus = tensordict.get(under_next(self.tensor_keys.prior_bonus), None)
         if bonus is not None:
             logs["prior_bonus"] = bonus
 
@@ -425,7 +426,7 @@ class AE2RLoss(LossModule):
     def _td_error(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """The TD error on raw rewards, detached, and the elementwise loss of the raw critic if it is trained here."""
         reward, terminated = (
-            self._get(tensordict, _next(key)) for key in (self.tensor_keys.reward, self.tensor_keys.terminated)
+            self._get(tensordict, under_next(key)) for key in (self.tensor_keys.reward, self.tensor_keys.terminated)
         )
         with contextlib.nullcontext() if self._trains_critic else torch.no_grad():
             value = self._evaluate("critic_network", tensordict, self.tensor_keys.value)
@@ -450,23 +451,23 @@ class AE2RLoss(LossModule):
             )
         weight = self._evaluate("prior_weight", tensordict, self.tensor_keys.prior_weight)
         signal = alignment(self._get(tensordict, self.tensor_keys.prior_log_prob), entropy.detach())
-        return weight, _weight_regression(target.detach(), weight, signal.detach())
+        return weight, weight_regression(target.detach(), weight, signal.detach())
 
     def _regress_on_td_error(self, tensordict: TensorDictBase, delta: Tensor | None) -> tuple[Tensor, Tensor]:
         """The weight at s_t (s_{t+1} where that at s_t is of no use), and its elementwise loss at the bonus' state."""
         assert delta is not None
         names = self.tensor_keys
         shifted = self.spec.bonus == "next"
-        where, at = (_next, tensordict.get("next")) if shifted else (_root, tensordict)
+        where, at = (under_next, tensordict.get("next")) if shifted else (unravel_key, tensordict)
         log_prob = self._get(tensordict, where(names.prior_log_prob))
         center = 0.0 if self.centering == "none" else self._get(tensordict, where(names.prior_center))
         signal = prior_bonus(self.bonus_coeff, log_prob, center)
         if shifted:  # what follows an end may be no observation (NaN where environments reset themselves)
-            at = _where(~self._get(tensordict, _next(names.terminated)), at.select(*self.prior_weight.in_keys))
+            at = keep_where(~self._get(tensordict, under_next(names.terminated)), at.select(*self.prior_weight.in_keys))
         weight = self._evaluate("prior_weight", at, names.prior_weight)
         if shifted:
-            signal = torch.where(self._get(tensordict, _next(names.terminated)), torch.zeros_like(signal), signal)
-        loss = _weight_regression(-delta, weight, signal.detach())
+            signal = torch.where(self._get(tensordict, under_next(names.terminated)), torch.zeros_like(signal), signal)
+        loss = weight_regression(-delta, weight, signal.detach())
         if shifted and self.spec.auxiliary:
             with torch.no_grad():
                 weight = self._evaluate("prior_weight", tensordict, names.prior_weight)
@@ -499,39 +500,3 @@ class AE2RLoss(LossModule):
             network = None if name is None else getattr(self, name)
             if network is not None and any(True for _ in network.parameters()):
                 self._reset_module_parameters(name, network)
-
-
-def _root(key: NestedKey) -> NestedKey:
-    return key
-
-
-def _next(key: NestedKey) -> NestedKey:
-    return ("next", key) if isinstance(key, str) else ("next", *key)
-
-
-def _where(mask: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-    """The entries where ``mask`` ``[*B, 1]`` is true, and 0 elsewhere."""
-    mask = mask.squeeze(-1)
-    return tensordict.apply(
-        lambda value: torch.where(mask[(...,) + (None,) * (value.ndim - mask.ndim)], value, torch.zeros_like(value))
-    )
-
-
-def _weight_regression(target: Tensor, weight: Tensor, signal: Tensor) -> Tensor:
-    """The prior weight's loss, refusing shapes that would broadcast to an outer product over the batch."""
-    if not target.shape == weight.shape == signal.shape:
-        raise ValueError(
-            "The target of the prior weight, the weight and the log-probabilities of the prior must have one shape"
-            f" [*B, 1], got {tuple(target.shape)}, {tuple(weight.shape)} and {tuple(signal.shape)}."
-        )
-    return prior_weight_loss(target, weight, signal)
-
-
-def _out_key(network: TensorDictModuleBase, default: NestedKey) -> NestedKey:
-    """Where a network writes its result: the default if it is one of its keys, else the last of them."""
-    return default if default in network.out_keys else network.out_keys[-1]
-
-
-def _check_option(name: str, value: str, options: tuple[str, ...]) -> None:
-    if value not in options:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, options))}, got {value!r}.")

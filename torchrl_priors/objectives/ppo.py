@@ -14,7 +14,8 @@ from torchrl.objectives import ClipPPOLoss
 
 from torchrl_priors.methods import MethodSpec
 
-from .ae2r import AE2RLoss, _out_key
+from .ae2r import AE2RLoss
+from .batch import out_key
 
 __all__ = ["ClipPPOPriorLoss"]
 
@@ -161,7 +162,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
         self.prior_loss = prior_loss
         keys: dict[str, NestedKey] = {"prior_weight": prior_loss.tensor_keys.prior_weight}
         if prior_critic_network is not None:
-            keys["raw_value"] = _out_key(prior_critic_network, self.tensor_keys.raw_value)
+            keys["raw_value"] = out_key(prior_critic_network, self.tensor_keys.raw_value)
         if prior_loss.spec.bonus == "none":
             keys["reward"] = "reward"
         self.set_keys(**keys)

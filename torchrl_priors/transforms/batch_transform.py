@@ -6,19 +6,13 @@ from copy import deepcopy
 from typing import Any, NoReturn
 
 from tensordict import NestedKey, TensorDictBase
-from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 
 from torchrl_priors.objectives import AE2RLoss
 
-__all__ = ["BatchTransform", "prior_loss_of", "under_next"]
-
-
-def under_next(key: NestedKey) -> NestedKey:
-    """The key of the same entry of the next step."""
-    return unravel_key(("next", key))
+__all__ = ["BatchTransform", "prior_loss_of"]
 
 
 def prior_loss_of(loss: LossModule) -> AE2RLoss:

@@ -11,10 +11,10 @@ from tensordict.utils import unravel_key
 from torchrl.envs import Compose
 
 from torchrl_priors.methods import get_method
+from torchrl_priors.objectives.batch import under_next
 from torchrl_priors.objectives.multi_teacher import check_namespaces
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import ActionPrior
-from torchrl_priors.transforms.batch_transform import under_next
 from torchrl_priors.transforms.prior_bonus import PriorBonus
 from torchrl_priors.transforms.prior_log_prob import PriorLogProb
 

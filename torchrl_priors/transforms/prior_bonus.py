@@ -12,8 +12,9 @@ from torchrl.objectives import LossModule
 
 from torchrl_priors.functional import prior_bonus
 from torchrl_priors.methods import get_method
+from torchrl_priors.objectives.batch import under_next
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of, under_next
+from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of
 
 __all__ = ["PriorBonus"]
 

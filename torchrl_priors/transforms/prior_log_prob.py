@@ -13,9 +13,10 @@ from torch import distributions as d
 from torchrl.objectives import LossModule
 
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
+from torchrl_priors.objectives.batch import under_next
 from torchrl_priors.objectives.cross_entropy import cross_entropy
 from torchrl_priors.priors import ActionPrior
-from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of, under_next
+from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of
 
 __all__ = ["PriorLogProb"]
 
