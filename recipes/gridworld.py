@@ -1,6 +1,6 @@
-"""The tabular study: sample worlds, train a teacher in each, then every student with every prior, and report.
+"""The tabular study: in each world a teacher, then every student with every prior; tables and figures of all of them.
 
-    python -m recipes.gridworld [study=small|paper|beyond] [key=value ...]
+    python -m recipes.gridworld [study=paper|small|beyond|comparisons] [key=value ...]
 
 An interrupted run continues where it was; a finished one only reports again. See ``conf/gridworld.yaml`` for the keys.
 """
@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,30 +20,15 @@ import torch
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from recipes import gridworld_report
+from recipes import gridworld_report, tabular, tabular_runs
 from recipes.gridworld_config import GridworldConfig, check
 from recipes.launchers import fail
 from recipes.runs import RunFolder, digest
 from recipes.schedule_config import applies, make_schedule, without_idle
-from recipes.workers import run_all
-from torchrl_priors.envs import GridMaps, GridWorlds, sample_worlds
-from torchrl_priors.random import derive_key
-from torchrl_priors.tabular import (
-    Hyper,
-    StudentConfig,
-    TeacherHyper,
-    evaluate_greedy,
-    parse_prior,
-    runs_of,
-    sample_degraded,
-    train_students,
-    train_teachers,
-)
+from torchrl_priors.envs import GridWorlds, sample_worlds
 
-#: Teachers trained together.
-_TEACHERS = 2048
 #: What the results do not depend on.
-_INCIDENTAL = ("out", "workers", "lanes", "block_worlds")
+_INCIDENTAL = ("out", "workers", "block_worlds")
 
 
 def open_folder(cfg: GridworldConfig) -> RunFolder:
@@ -54,128 +40,135 @@ def open_folder(cfg: GridworldConfig) -> RunFolder:
     return RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True))
 
 
-def world_sampler(cfg: GridworldConfig, seeds: torch.Tensor) -> GridWorlds:
-    """One world per seed."""
-    world = cfg.world
-    return sample_worlds(
-        seeds, size=world.size, window=world.window, wall_prob=world.wall_prob, object_prob=world.object_prob
-    )
+def sample_world(cfg: GridworldConfig, seed: int) -> GridWorlds:
+    """The world of a seed, as a batch of one."""
+    names = ("size", "window", "wall_prob", "object_prob")
+    return sample_worlds(torch.tensor([seed]), **{name: cfg.world[name] for name in names})  # type: ignore[index]
 
 
-def teachers(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
-    """Action values and facts about each world; kept in ``teachers.npz``."""
-    hyper = TeacherHyper(cfg.teacher.gamma, cfg.teacher.lr, cfg.teacher.epsilon, cfg.world.noise, cfg.world.end_prob)
-
-    def compute() -> dict[str, np.ndarray]:
-        seeds = torch.arange(cfg.seed, cfg.seed + cfg.worlds, device=cfg.device)
-        parts = []
-        with tqdm(total=cfg.worlds * cfg.teacher.steps, unit="step", unit_scale=True, desc="teachers") as bar:
-            for chunk in seeds.split(_TEACHERS):
-                worlds = world_sampler(cfg, chunk)
-                q, visited = train_teachers(
-                    worlds, chunk, hyper, steps=cfg.teacher.steps, compile=cfg.compile, progress=bar.update
-                )
-                start = worlds.start + torch.arange(len(chunk), device=cfg.device) * worlds.num_cells
-                returns, lengths = evaluate_greedy(
-                    GridMaps.from_worlds(worlds),
-                    derive_key(chunk, "teacher-evaluation"),
-                    start,
-                    q.flatten(),
-                    hyper,
-                    episodes=cfg.teacher.eval_episodes,
-                )
-                part = {"seed": chunk, "q": q, "visited": visited, "return": returns, "length": lengths}
-                parts.append(part | {"goal": worlds.has_goal()})
-        return {name: torch.cat([part[name] for part in parts]).cpu().numpy() for name in parts[0]}
-
-    return folder.arrays("teachers", compute)
-
-
-def student_config(cfg: GridworldConfig) -> StudentConfig:
-    """How students learn."""
-    rates, points, interval = cfg.student.lr_weight, cfg.evaluation.points, cfg.evaluation.interval
-    annealed = any(applies(cfg.schedule, method) for method in cfg.methods)
-    return StudentConfig(
-        hyper=Hyper(
-            gamma=cfg.student.gamma,
-            lr=cfg.student.lr,
-            noise=cfg.world.noise,
-            end_prob=cfg.world.end_prob,
-            eval_interval=interval,
-            eval_points=points,
-            schedule=make_schedule(cfg.schedule, points * interval) if annealed else None,
-        ),
+def make_learner(cfg: GridworldConfig, method: str) -> tabular.Learner:
+    """How the students of a method learn."""
+    rates, budget = cfg.student.lr_weight, cfg.evaluation.points * cfg.evaluation.interval
+    schedule = None
+    if applies(cfg.schedule, method):
+        schedule = make_schedule(cfg.schedule, budget)(torch.arange(budget + 1)).double().numpy()
+    return tabular_runs.learner_of(
+        method,
+        gamma=cfg.student.gamma,
+        lr=cfg.student.lr,
         lr_weight={"td": rates.shaped if cfg.td_error == "shaped" else rates.original, "advantage": rates.advantage},
         td_error=cfg.td_error,
         bonus_coeff=cfg.student.bonus_coeff,
         aux_coeff=cfg.student.aux_coeff,
-        temperature=cfg.teacher.temperature,
-        anneal_all=cfg.schedule.methods == "all",
+        schedule=schedule,
     )
 
 
-@dataclass(frozen=True)
-class Block:
-    """Some worlds of a study, whose students are trained as one batch and kept in one file."""
+class TaughtWorld:
+    """A world with its teacher, and the students who learn there.
 
-    cfg: GridworldConfig
-    folder: RunFolder
-    name: str
-    worlds: slice
+    Args:
+        cfg (GridworldConfig): the study.
+        seed (int): of the world and of everything in it.
+    """
+
+    def __init__(self, cfg: GridworldConfig, seed: int) -> None:
+        self.cfg, self.seed = cfg, seed
+        self.grid = sample_world(cfg, seed)
+        self.world = tabular.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
+        states, teacher = len(self.world.state), cfg.teacher
+        self.q, self.visited = np.zeros((states, 4)), np.zeros(states, bool)
+        rng = tabular_runs.generator(seed, "teacher")
+        tabular.teach(
+            self.world, self.q, self.visited, teacher.steps, float(teacher.gamma), float(teacher.lr),
+            float(teacher.epsilon), rng,
+        )  # fmt: skip
+
+    def facts(self) -> dict[str, Any]:
+        """What ``worlds.csv`` says about the world and its teacher."""
+        rng = tabular_runs.generator(self.seed, "teacher evaluation")
+        episodes = [tabular.teacher_episode(self.world, self.q, rng) for _ in range(self.cfg.teacher.eval_episodes)]
+        total, length = np.mean(episodes, 0)
+        return {
+            "seed": self.seed,
+            "distinct_states": self.visited.sum(),
+            "teacher_return": total,
+            "teacher_length": length,
+            "reachable_goal": bool(self.grid.has_goal()),
+        }
+
+    def advice(self, prior: str) -> tabular.Advice:
+        """What the prior of this name says."""
+        spec = tabular_runs.parse_prior(prior or "expert")
+        return tabular_runs.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
+
+    def train(
+        self, method: str, prior: str, advice: tabular.Advice, learner: tabular.Learner, *, watch: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The evaluation episodes of a student, ``[points, 8]``; its weights and visits at each if they are watched."""
+        points, states = self.cfg.evaluation.points, len(self.world.state)
+        log, weights = np.zeros((points, len(tabular.LOG_FIELDS))), np.zeros((points if watch else 0, states))
+        visits = np.zeros(weights.shape, np.int64)
+        tabular.train(
+            self.world,
+            advice,
+            learner,
+            tabular_runs.new_tables(states, learner.adaptive),
+            self.cfg.evaluation.interval,
+            log,
+            weights,
+            visits,
+            tabular_runs.generator(self.seed, "student", method, prior),
+        )
+        return log, weights, visits
 
 
-def train_block(block: Block, progress: Callable[[int], Any]) -> None:
-    """Train every student in the block's worlds, unless they are there already."""
-    block.folder.arrays(block.name, lambda: {"episodes": _train(block, progress)})
+def run_world(
+    cfg: GridworldConfig, seed: int, learners: dict[str, tabular.Learner], progress: Callable[[int], Any]
+) -> dict[str, Any]:
+    """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 8]``."""
+    taught = TaughtWorld(cfg, seed)
+    progress(cfg.teacher.steps)
+    advice = {prior: taught.advice(prior) for prior in ("", *cfg.priors)}
+    episodes = []
+    for method, prior in tabular_runs.runs_of(cfg.methods, cfg.priors):
+        episodes.append(taught.train(method, prior, advice[prior], learners[method])[0].astype(np.float32))
+        progress(cfg.evaluation.points * cfg.evaluation.interval)
+    return {**taught.facts(), "episodes": np.stack(episodes)}
 
 
-def _train(block: Block, progress: Callable[[int], Any]) -> np.ndarray:
-    cfg = block.cfg
-    taught = block.folder.arrays("teachers")
-    seeds, q, visited = (
-        torch.from_numpy(taught[name][block.worlds]).to(cfg.device) for name in ("seed", "q", "visited")
-    )
-    counts = sorted({parse_prior(prior).structural for prior in cfg.priors} - {0})
-    episodes = train_students(
-        world_sampler(cfg, seeds),
-        seeds,
-        q,
-        {count: sample_degraded(q, visited, seeds, count, cfg.teacher.temperature) for count in counts},
-        runs_of(cfg.methods, cfg.priors),
-        student_config(cfg),
-        lanes=cfg.lanes,
-        compile=cfg.compile,
-        progress=progress,
-    )
-    return episodes.cpu().numpy()
-
-
-def students(cfg: GridworldConfig, folder: RunFolder) -> np.ndarray:
-    """Evaluation episodes of every run, ``[worlds, pairs, points, fields]``; each block is kept in ``blocks/``."""
-    workers = (len(os.sched_getaffinity(0)) if cfg.workers is None else cfg.workers) if cfg.device == "cpu" else 1
-    pairs = len(runs_of(cfg.methods, cfg.priors))
-    # Blocks are equal in size, for a compiled step serves one shape: the last one is filled up with worlds of the one
-    # before, whose results are the same there. Small studies are split too, so that every worker has a block.
-    count = max(-(-cfg.worlds // cfg.block_worlds), min(workers, cfg.worlds))
-    size = -(-cfg.worlds // count)
-    firsts = range(0, cfg.worlds, size)
-    begins = [min(first, cfg.worlds - size) for first in firsts]
-    blocks = [
-        Block(cfg, folder, f"blocks/{first:06d}-{size}", slice(begin, begin + size))
-        for first, begin in zip(firsts, begins, strict=True)
-    ]
+def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
+    """What :func:`run_world` returns, stacked over worlds; blocks of worlds are kept in ``blocks/``."""
+    learners = {method: make_learner(cfg, method) for method in cfg.methods}
+    pairs, budget = tabular_runs.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
+    per_world = cfg.teacher.steps + len(pairs) * budget
+    blocks = {
+        f"blocks/{first:06d}": range(first, min(first + cfg.block_worlds, cfg.worlds))
+        for first in range(0, cfg.worlds, cfg.block_worlds)
+    }
     # Read at once what is there, so that a damaged file is found before any work.
-    kept = {block.name: folder.arrays(block.name)["episodes"] for block in blocks if folder.has(block.name)}
-    missing = [block for block in blocks if block.name not in kept]
-    budget = size * pairs * cfg.evaluation.points * cfg.evaluation.interval
-    with tqdm(total=len(blocks) * budget, unit="step", unit_scale=True, desc="students") as bar:
-        bar.update((len(blocks) - len(missing)) * budget)
-        # Runs end with an episode, a little after their budget.
-        run_all(train_block, missing, workers, lambda steps: bar.update(min(steps, bar.total - bar.n)))
-        bar.update(bar.total - bar.n)
-    kept |= {block.name: folder.arrays(block.name)["episodes"] for block in missing}
-    offsets = [first - begin for first, begin in zip(firsts, begins, strict=True)]
-    return np.concatenate([kept[block.name][offset:] for block, offset in zip(blocks, offsets, strict=True)])
+    kept = {name: folder.arrays(name) for name in blocks if folder.has(name)}
+    missing = [name for name in blocks if name not in kept]
+    pool = ThreadPoolExecutor(cfg.workers or len(os.sched_getaffinity(0)))
+    with tqdm(total=cfg.worlds * per_world, unit="step", unit_scale=True, desc="compiling" if missing else None) as bar:
+
+        def progress(steps: int) -> None:
+            bar.set_description("learning", refresh=False)
+            bar.update(steps)
+
+        bar.update(per_world * sum(len(blocks[name]) for name in kept))
+        try:
+            futures = {
+                name: [pool.submit(run_world, cfg, cfg.seed + world, learners, progress) for world in blocks[name]]
+                for name in missing
+            }
+            for name in missing:
+                worlds = [future.result() for future in futures.pop(name)]
+                stacked = {what: np.stack([world[what] for world in worlds]) for what in worlds[0]}
+                kept[name] = folder.arrays(name, partial(dict, stacked))
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return {what: np.concatenate([kept[name][what] for name in blocks]) for what in kept[next(iter(blocks))]}
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="gridworld")
@@ -184,10 +177,8 @@ def main(cfg: GridworldConfig) -> str | None:
     try:
         check(cfg)
         folder = open_folder(cfg)
-        torch.set_num_threads(1)  # rows are spread over processes instead, see `workers`
-        taught = teachers(cfg, folder)
-        episodes = students(cfg, folder)
-        gridworld_report.write(cfg, folder, world_sampler(cfg, torch.from_numpy(taught["seed"])), taught, episodes)
+        results = run_study(cfg, folder)
+        gridworld_report.write(cfg, folder, sample_world(cfg, cfg.seed), results)
     except (ValueError, OSError) as error:
         return fail(f"Error: {error}")
     return None

@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import check_keys, require_compiler
+from recipes.checks import check_keys
 from recipes.schedule_config import ScheduleConfig, check_schedule
+from recipes.tabular_runs import parse_prior
 from torchrl_priors.methods import get_method
-from torchrl_priors.tabular.advice import parse_prior
 
 __all__ = ["GridworldConfig", "check"]
 
@@ -93,10 +92,7 @@ class GridworldConfig:
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     evaluation: Evaluation = field(default_factory=Evaluation)
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
-    device: str = MISSING
     workers: int | None = MISSING
-    compile: bool = MISSING
-    lanes: int = MISSING
     block_worlds: int = MISSING
     out: str | None = MISSING
 
@@ -134,7 +130,6 @@ def check(cfg: GridworldConfig) -> None:
         "evaluation.points": cfg.evaluation.points,
         "evaluation.interval": cfg.evaluation.interval,
         "bootstrap.reps": cfg.bootstrap.reps,
-        "lanes": cfg.lanes,
         "block_worlds": cfg.block_worlds,
         "world.size": cfg.world.size,
         "teacher.temperature": cfg.teacher.temperature,
@@ -160,8 +155,3 @@ def check(cfg: GridworldConfig) -> None:
     for key, value in rates.items():
         _require(0 <= value < float("inf"), key, value, "a number of at least 0")
     _require(0 <= cfg.seed < 2**62, "seed", cfg.seed, "a number in [0, 2**62)")
-    try:
-        torch.zeros(1, device=cfg.device).item()  # the meta device has no numbers
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device={cfg.device}: not available here ({str(error).splitlines()[0]})") from None
-    require_compiler(cfg.compile, cfg.device)

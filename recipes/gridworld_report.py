@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 
 from recipes.gridworld_config import GridworldConfig
 from recipes.runs import RunFolder
+from recipes.tabular import LOG_FIELDS
+from recipes.tabular_runs import runs_of
 from torchrl_priors import plots
 from torchrl_priors.envs import GridWorldEnv, GridWorlds
 from torchrl_priors.methods import get_method
@@ -22,7 +24,6 @@ from torchrl_priors.metrics import (
     mean_confidence_interval,
     stratified_bootstrap_ci,
 )
-from torchrl_priors.tabular import LOG_FIELDS, runs_of
 
 __all__ = ["write"]
 
@@ -119,18 +120,10 @@ def _mean_and_ci_of_sums(total: float, square: float, count: float) -> list[floa
     return [mean, 1.96 * deviation / count**0.5]
 
 
-def world_table(taught: dict[str, np.ndarray], data: Episodes) -> pd.DataFrame:
+def world_table(results: dict[str, np.ndarray], data: Episodes) -> pd.DataFrame:
     """Facts about each world."""
-    return pd.DataFrame(
-        {
-            "seed": taught["seed"],
-            "distinct_states": taught["visited"].sum(-1),
-            "teacher_return": taught["return"],
-            "teacher_length": taught["length"],
-            "reachable_goal": taught["goal"],
-            "baseline_area": data.baseline,
-        }
-    )
+    facts = {name: values for name, values in results.items() if name != "episodes"}
+    return pd.DataFrame({**facts, "baseline_area": data.baseline})
 
 
 def learning_curves(cfg: GridworldConfig, data: Episodes) -> dict[str, dict[str, ConfidenceInterval]]:
@@ -194,18 +187,16 @@ def figures(
     }
 
 
-def write(
-    cfg: GridworldConfig, folder: RunFolder, worlds: GridWorlds, taught: dict[str, np.ndarray], episodes: np.ndarray
-) -> None:
+def write(cfg: GridworldConfig, folder: RunFolder, world: GridWorlds, results: dict[str, np.ndarray]) -> None:
     """Write every table and figure into the folder, and print the main table and the paths."""
-    data = Episodes(cfg, episodes)
+    data = Episodes(cfg, results["episodes"])
     curves = learning_curves(cfg, data)
     ratios, weights = area_ratio_table(cfg, data), prior_weight_table(cfg, data)
     tables = {
         "area_ratio": ratios,
         "comparisons": comparison_table(cfg, data),
         "prior_weights": weights,
-        "worlds": world_table(taught, data),
+        "worlds": world_table(results, data),
         "curves": curve_table(cfg, curves),
     }
     written = [
@@ -213,7 +204,7 @@ def write(
         for name, table in tables.items()
         if len(table)
     ]
-    pictures = {"world": GridWorldEnv(worlds[:1]).render()}
+    pictures = {"world": GridWorldEnv(world).render()}
     if len(ratios):
         pictures |= figures(cfg, data, ratios, curves)
     if by_state := prior_weight_curves(cfg, data):
@@ -223,19 +214,26 @@ def write(
         written += plots.save_figure(figure, folder.path / name)
 
     print(f"\nArea ratio x 1000, IQM over {cfg.worlds} worlds (95 % CI), td_error={cfg.td_error}\n")
-    print(_readable(cfg, ratios))
+    print(_readable(ratios))
     if len(weights):
         print("\nPrior weight in evaluation episodes, by visit (+- 95 % CI)\n")
         by_visit = weights[weights.average == "visit"].drop(columns="average")
+        by_visit = by_visit.rename(columns={"non_degraded": "other", "non_degraded_ci": "other_ci"})
         print(by_visit.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
     print("\nWritten:", *(f"  {path}" for path in written), sep="\n")
 
 
-def _readable(cfg: GridworldConfig, ratios: pd.DataFrame) -> str:
-    cells = {
-        (row.prior, row.method): f"{1000 * row.iqm:.0f} ({1000 * row.ci_low:.0f}, {1000 * row.ci_high:.0f})"
-        for row in ratios.itertuples()
-    }
-    methods = [method for method in cfg.methods if method != "none"]
-    rows = [[cells[prior, method] for method in methods] for prior in cfg.priors]
-    return pd.DataFrame(rows, index=list(cfg.priors), columns=methods).to_string()
+def _readable(ratios: pd.DataFrame) -> str:
+    """A block per prior, which fits into 80 columns whatever the number of methods."""
+
+    def cell(estimate: float, low: float, high: float) -> str:
+        return "" if np.isnan(estimate) else f"{1000 * estimate:.0f} ({1000 * low:.0f}, {1000 * high:.0f})"
+
+    lines = [f"{'prior':16}{'method':20}{'here':>20}{'the paper':>20}"]
+    for prior, rows in ratios.groupby("prior", sort=False):
+        for row in rows.itertuples():
+            here = cell(row.iqm, row.ci_low, row.ci_high)
+            paper = cell(row.paper_iqm, row.paper_ci_low, row.paper_ci_high)
+            lines.append(f"{prior:16}{row.method:20}{here:>20}{paper:>20}".rstrip())
+            prior = ""
+    return "\n".join(lines)

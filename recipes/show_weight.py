@@ -13,17 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-import torch
+import numpy as np
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
-from tqdm import tqdm
 
 from recipes.checks import check_keys
-from recipes.gridworld import student_config, world_sampler
+from recipes.gridworld import TaughtWorld, make_learner
 from recipes.report_runs import is_gridworld
+from recipes.tabular_runs import parse_prior
 from torchrl_priors import plots
 from torchrl_priors.methods import get_method
-from torchrl_priors.tabular import TeacherHyper, parse_prior, sample_degraded, train_teachers, weight_history
 
 
 @dataclass
@@ -85,7 +84,7 @@ def _show_gridworld(cfg: ShowConfig, folder: Path, out: Path) -> list[Path]:
     idle = {"schedule": {"methods": "annealed"}}  # a study may be older than schedules
     study: Any = OmegaConf.merge(idle, OmegaConf.load(folder / "config.yaml"))
     method, prior, last = cfg.gridworld.method, cfg.gridworld.prior, study.evaluation.points
-    count = parse_prior(prior).structural
+    parse_prior(prior)
     if not get_method(method).adaptive:
         raise ValueError(f"gridworld.method={method}: it has no learned weight.")
     if not 0 <= cfg.seed < study.worlds:
@@ -94,52 +93,41 @@ def _show_gridworld(cfg: ShowConfig, folder: Path, out: Path) -> list[Path]:
     if not points or points[0] < 1:
         raise ValueError(f"gridworld.points={cfg.gridworld.points}: expected numbers from 1 to {last}.")
 
-    seeds = torch.tensor([study.seed + cfg.seed])
-    world = world_sampler(study, seeds)
-    hyper = TeacherHyper(
-        study.teacher.gamma, study.teacher.lr, study.teacher.epsilon, study.world.noise, study.world.end_prob
-    )
-    torch.set_num_threads(1)
-    q, visited = train_teachers(world, seeds, hyper, steps=study.teacher.steps, compile=study.compile)
-    degraded = {count: sample_degraded(q, visited, seeds, count, study.teacher.temperature)} if count else {}
-    study.methods = [method]
-    with tqdm(total=last, unit="evaluation", desc=f"{method}, {prior}") as bar:
-        history = weight_history(
-            world,
-            int(seeds),
-            q,
-            degraded,
-            (method, prior),
-            student_config(study),
-            compile=study.compile,
-            progress=bar.update,
-        )
-    bad = degraded[count][0] if count else torch.zeros(world.num_cells, dtype=torch.bool)
-    state = world.state[0]
+    # One student of the study once more: its runs depend on their seed alone.
+    taught = TaughtWorld(study, study.seed + cfg.seed)
+    advice = taught.advice(prior)
+    _, weights, visits = taught.train(method, prior, advice, make_learner(study, method), watch=True)
+    world, bad, state = taught.grid[0], advice.degraded, taught.world.state
 
-    def square(values: torch.Tensor) -> Any:
-        return values.view(world.size, world.size).numpy()
+    def square(values: Any) -> Any:
+        return np.asarray(values).reshape(world.size, world.size)
 
+    blank = square((world.kind == 1) | world.terminal)
     maps = {}
     for point in points:
-        seen = history.visits[point - 1] > 0
-        weight = torch.where(seen, history.weight[point - 1], torch.nan)[state]
-        weight[(world.kind[0] == 1) | world.terminal[0]] = torch.nan
-        maps[f"After {point * study.evaluation.interval:,} transitions"] = square(weight)
+        weight = square(np.where(visits[point - 1] > 0, weights[point - 1], np.nan)[state])
+        maps[f"After {point * study.evaluation.interval:,} transitions"] = np.where(blank, np.nan, weight)
     figure = plots.weight_maps(
         {
-            "walls": square(world.kind[0] == 1),
-            "rewards": square(world.reward[0]),
-            "terminal": square(world.terminal[0]),
+            "walls": square(world.kind == 1),
+            "rewards": square(world.reward),
+            "terminal": square(world.terminal),
             "start": divmod(int(world.start), world.size),
         },
         maps,
         square(bad[state]),
-        steps=torch.arange(1, last + 1) * study.evaluation.interval,
-        over_degraded=history.mean_over(bad),
-        over_other=history.mean_over(~bad),
+        steps=np.arange(1, last + 1) * study.evaluation.interval,
+        over_degraded=mean_over(bad, weights, visits),
+        over_other=mean_over(~bad, weights, visits),
     )
     return plots.save_figure(figure, out / f"weight_{method}_{prior}_{cfg.seed}")
+
+
+def mean_over(states: np.ndarray, weights: np.ndarray, visits: np.ndarray) -> np.ndarray:
+    """Mean weight of the states (bool ``[C]``) that were visited by then, at each point; NaN if there is none."""
+    seen = (visits > 0) & states
+    with np.errstate(invalid="ignore"):
+        return np.where(seen, weights, 0.0).sum(-1) / seen.sum(-1)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="show_weight")

@@ -26,7 +26,7 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.DOTALL | re.MULTILINE)
 # What makes the commands short: appended to each of a recipe. Lengths and sizes only, never what is shown.
 SHORT = {
     "recipes.gridworld": "worlds=2 teacher.steps=200 teacher.eval_episodes=1 evaluation.points=3 "
-    "evaluation.interval=20 bootstrap.reps=20 compile=false workers=1",
+    "evaluation.interval=20 bootstrap.reps=20",
     "recipes.mujoco": "env.num_envs=2 env.frames_per_batch=64 env.minibatch_size=32 total_frames=128 ppo.epochs=1 "
     "ppo.hidden=[8] evaluation.interval=64 evaluation.episodes=1 checkpoint.interval=128 compile=false",
     "recipes.report": "bootstrap.reps=20",

@@ -12,16 +12,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from recipes.gridworld import main, open_folder
+from recipes.tabular import LOG_FIELDS
+from recipes.tabular_runs import runs_of
 from torchrl_priors.methods import METHODS
-from torchrl_priors.tabular import LOG_FIELDS, runs_of
 
 ROOT = Path(__file__).parents[1]
 PRIORS = ["expert", "random_15", "random_30", "random_50", "structural_3", "structural_5", "structural_10"]
-TINY = ["compile=false", "workers=1", "teacher.steps=500", "teacher.eval_episodes=2", "bootstrap.reps=50"]
+TINY = ["study=small", "workers=1", "teacher.steps=500", "teacher.eval_episodes=2", "bootstrap.reps=50"]
 TINY += ["evaluation.points=5", "evaluation.interval=20"]
 FIGURES = ["learning_curves", "performance_profiles", "iqm", "world"]
 
@@ -32,7 +32,6 @@ def recipe(*overrides: object) -> int:
         patch.chdir(ROOT)
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
         patch.setattr(sys, "argv", ["gridworld", *TINY, *map(str, overrides)])
-        patch.setattr(torch, "set_num_threads", lambda threads: None)
         try:
             main()
         except SystemExit as end:
@@ -158,9 +157,10 @@ def test_every_study_runs_and_the_shaped_reading_too(study, tmp_path):
     assert (out / "learning_curves.png").exists()
 
 
-# 20 runs of five worlds, long enough to be killed in the middle.
 FIVE = ["worlds=5", "priors=[expert,structural_3]", "methods=[none,ae2r,aligned]", "world.end_prob=0.05"]
 FIVE += ["evaluation.interval=100"]
+# Long enough to be killed in the middle.
+LONG = ["worlds=12", "priors=[expert]", "methods=[none,ae2r]", "evaluation.interval=200000"]
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def five(tmp_path_factory) -> Path:
     return out
 
 
-@pytest.mark.parametrize("how", [("lanes=16",), ("workers=2", "block_worlds=2")])
+@pytest.mark.parametrize("how", [("workers=2",), ("workers=3", "block_worlds=2")])
 def test_results_do_not_depend_on_how_the_work_is_divided(five, how, tmp_path):
     assert recipe(*FIVE, *how, f"out={tmp_path / 'again'}") == 0
     assert tables(tmp_path / "again") == tables(five)
@@ -218,16 +218,12 @@ def test_worlds_are_the_same_in_a_larger_study(small, tmp_path):
         ("evaluation.points=0", "evaluation.points=0"),
         ("evaluation.interval=0", "evaluation.interval=0"),
         ("bootstrap.reps=0", "bootstrap.reps=0"),
-        ("lanes=0", "lanes=0"),
         ("block_worlds=0", "block_worlds=0"),
         ("workers=0", "workers=0"),
         ("seed=-1", "seed=-1"),
         (f"seed={2**63 - 1}", "seed="),
         ("teacher.temperature=inf", "teacher.temperature=inf"),
-        ("device=nonsense", "device=nonsense"),
-        pytest.param(
-            "device=cuda", "device=cuda", marks=pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
-        ),
+        ("device=cuda", "device"),
     ],
 )
 def test_bad_input_is_refused_by_name_before_anything_is_written(override, named, tmp_path, capfd):
@@ -280,7 +276,7 @@ def test_damaged_block_is_named_and_nothing_is_lost(five, tmp_path, capfd):
 
 
 def test_default_folder_differs_for_each_configuration(tmp_path):
-    plain = {"name": "small", "out": None, "lanes": 1, "methods": ["none"], "schedule": {"methods": "annealed"}}
+    plain = {"name": "small", "out": None, "block_worlds": 1, "methods": ["none"], "schedule": {"methods": "annealed"}}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         paths = [
@@ -291,12 +287,13 @@ def test_default_folder_differs_for_each_configuration(tmp_path):
     assert paths[2] != paths[0]
 
 
-def test_killed_run_continues_to_the_same_tables(five, tmp_path):
-    out = tmp_path / "killed"
+def test_killed_run_continues_to_the_same_tables(tmp_path):
+    whole, out = tmp_path / "whole", tmp_path / "killed"
+    assert recipe(*LONG, f"out={whole}") == 0
     kept: dict[Path, int] = {}
-    for workers, wanted in ((2, 2), (1, 3)):  # teachers and a block, then one more
+    for workers, wanted in ((2, 2), (1, 3)):  # two blocks, then at least one more
         with subprocess.Popen(
-            command(*FIVE, "block_worlds=1", f"workers={workers}", f"out={out}"),
+            command(*LONG, "block_worlds=1", f"workers={workers}", f"out={out}"),
             cwd=ROOT,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -305,12 +302,12 @@ def test_killed_run_continues_to_the_same_tables(five, tmp_path):
             while len(list(out.rglob("[!.]*.npz"))) < wanted:
                 assert run.poll() is None
                 assert time.monotonic() < deadline
-                time.sleep(0.02)
+                time.sleep(0.005)
             run.send_signal(signal.SIGKILL)
         assert run.returncode == -signal.SIGKILL
         assert not tables(out)
         assert all(file.stat().st_mtime_ns == written for file, written in kept.items())
         kept = {file: file.stat().st_mtime_ns for file in out.rglob("[!.]*.npz")}
-    assert recipe(*FIVE, "block_worlds=1", f"out={out}") == 0
+    assert recipe(*LONG, "block_worlds=1", f"out={out}") == 0
     assert all(file.stat().st_mtime_ns == written for file, written in kept.items())
-    assert tables(out) == tables(five)
+    assert tables(out) == tables(whole)

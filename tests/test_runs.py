@@ -5,15 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-import textwrap
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from recipes.runs import RunFolder, digest
-from recipes.workers import run_all
 
 CONFIG = {"worlds": 3, "student": {"lr": 0.1, "gamma": 0.95}, "methods": ["none", "er"]}
 NUMBERS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False])}
@@ -116,6 +113,13 @@ time.sleep(600)
 """
 
 
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 def test_a_folder_is_one_processs_until_it_dies_whatever_becomes_of_its_children(tmp_path):
     command = [sys.executable, "-c", HOLDER, str(tmp_path)]
@@ -203,68 +207,3 @@ def test_damaged_arrays_are_named_and_kept(tmp_path, damage):
 def test_arrays_that_were_not_computed_are_missing_not_made_up(tmp_path):
     with pytest.raises((ValueError, OSError), match="blocks/7"):
         RunFolder(tmp_path, CONFIG, "").arrays("blocks/7")
-
-
-def square(job: int, report) -> None:
-    """A job of the tests below: it leaves its result in a file, as the recipes' do."""
-    path, number = job
-    if number < 0:
-        raise ValueError(f"job {number} is broken")
-    report(number)
-    (path / str(number)).write_text(f"{number**2} {os.getpid()}")
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_every_job_is_done_once(tmp_path, workers):
-    counted: list[int] = []
-    run_all(square, [(tmp_path, number) for number in range(1, 5)], workers, counted.append)
-    results = [(tmp_path / str(number)).read_text().split() for number in range(1, 5)]
-    assert [int(result[0]) for result in results] == [1, 4, 9, 16]
-    assert len(set(counted)) == len(counted)
-    assert set(counted) <= {1, 2, 3, 4}  # a process may end before its last word has arrived
-    assert workers > 1 or len(counted) == 4
-    assert {int(result[1]) for result in results}.isdisjoint({os.getpid()}) == (workers > 1)
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_error_of_a_job_reaches_the_caller(tmp_path, workers):
-    with pytest.raises(ValueError, match="job -3 is broken"):
-        run_all(square, [(tmp_path, 1), (tmp_path, -3)], workers, lambda amount: None)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-def test_workers_end_when_their_parent_is_killed(tmp_path):
-    (tmp_path / "endless.py").write_text(
-        textwrap.dedent("""
-            import os, sys, time
-            from pathlib import Path
-            from recipes.workers import run_all
-
-            def wait(job, report):
-                Path(sys.argv[1] if len(sys.argv) > 1 else job, str(os.getpid())).touch()
-                time.sleep(600)
-
-            if __name__ == "__main__":
-                run_all(wait, [sys.argv[1]] * 2, 2, print)
-        """)
-    )
-    (tmp_path / "pids").mkdir()
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path.cwd()), str(tmp_path)])}
-    command = [sys.executable, str(tmp_path / "endless.py"), str(tmp_path / "pids")]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE) as parent:
-        deadline = time.monotonic() + 120
-        while len(pids := [int(file.name) for file in (tmp_path / "pids").iterdir()]) < 2:
-            assert parent.poll() is None, parent.stderr.read().decode()
-            assert time.monotonic() < deadline
-            time.sleep(0.1)
-        parent.send_signal(signal.SIGKILL)
-    while any(alive(pid) for pid in pids):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
-from tabular_cases import Study, play, read_tables
 from tensordict import TensorDict
 
-from recipes.show_weight import show
-from torchrl_priors.tabular import LOG_FIELDS, train_students, weight_history
+from recipes.gridworld import TaughtWorld, make_learner, run_world
+from recipes.show_weight import mean_over, show
 
 ROOT = Path(__file__).parents[1]
-SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20", "compile=false"]
+SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20"]
 
 
 def config(name: str, *overrides: object) -> DictConfig:
@@ -23,35 +23,22 @@ def config(name: str, *overrides: object) -> DictConfig:
         return compose(name, overrides=[str(override) for override in overrides])
 
 
-def test_a_history_is_of_the_very_run_of_the_study():
-    study = Study.small([("aligned", "structural_3")], worlds=1, eval_interval=30, eval_points=3)
-    args = (study.worlds, study.seeds, study.q, study.degraded, study.pairs, study.config)
-    history = weight_history(study.worlds, 0, *args[2:4], study.pairs[0], study.config)
-    assert history.weight.shape == history.visits.shape == (3, study.states)
-    # the same steps, watched by the tests' own loop
-    _, steps, _, runs = play(study, 600)
-    ends = [n for n, step in enumerate(steps) if step.after.points[0] > step.before.points[0]]
-    for point, end in enumerate(ends):
-        tables = read_tables(steps[end].records, len(runs.key))
-        torch.testing.assert_close(history.weight[point], tables.weight[0].sigmoid(), rtol=0, atol=1e-6)
-        trained = [int(step.state[0]) for step in steps[: end + 1] if not step.before.evaluating[0]]
-        assert history.visits[point].tolist() == torch.bincount(torch.tensor(trained), minlength=study.states).tolist()
-    assert len(ends) == 3
-    assert (history.weight[-1] - 0.5).abs().max() > 0.01
-    # and the study's log of the weights that evaluation episodes met is of these weights
-    log = train_students(*args)[0, 0]
-    met = log[:, LOG_FIELDS.index("w_other")] / log[:, LOG_FIELDS.index("n_other")]
-    for point, mean in enumerate(met.tolist()):
-        assert history.weight[point].min() - 1e-6 <= mean <= history.weight[point].max() + 1e-6
+def test_weights_are_of_the_very_run_of_the_study():
+    study = config("gridworld", *SMALL, "methods=[none,aligned]", "priors=[structural_3]", "seed=5")
+    study.evaluation.interval = 500  # until something was found
+    learner = make_learner(study, "aligned")
+    episodes = run_world(study, 6, {"none": make_learner(study, "none"), "aligned": learner}, lambda steps: None)
+    taught = TaughtWorld(study, 6)
+    log, weights, visits = taught.train("aligned", "structural_3", taught.advice("structural_3"), learner, watch=True)
+    assert np.array_equal(log.astype(np.float32), episodes["episodes"][1])
+    assert weights.shape == visits.shape == (3, 400)
+    assert np.abs(weights[-1] - 0.5).max() > 0
 
 
 def test_means_are_over_the_states_visited_by_then():
-    study = Study.small([("ae2r", "expert")], worlds=1, eval_interval=10, eval_points=1)
-    history = weight_history(study.worlds, 0, study.q, study.degraded, study.pairs[0], study.config)
-    history = history._replace(weight=torch.tensor([[0.2, 0.4, 0.9]]), visits=torch.tensor([[3, 1, 0]]))
-    everywhere = torch.tensor([True, True, True])
-    assert history.mean_over(everywhere).item() == pytest.approx(0.3)
-    assert history.mean_over(torch.tensor([False, False, True])).isnan().all()
+    weights, visits = np.array([[0.2, 0.4, 0.9]]), np.array([[3, 1, 0]])
+    assert mean_over(np.array([True, True, True]), weights, visits).item() == pytest.approx(0.3)
+    assert np.isnan(mean_over(np.array([False, False, True]), weights, visits)).all()
 
 
 def test_maps_of_a_study_are_made_from_its_configuration_alone(tmp_path):

@@ -1,93 +1,71 @@
+"""The priors of the study: names, degraded states, and what they advise."""
+
 from __future__ import annotations
 
 from itertools import combinations
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
-from torchrl_priors.tabular import advice_tables, parse_prior, runs_of, sample_degraded
-from torchrl_priors.tabular.actor_critic import ADVICE_WIDTH
+from recipes.tabular_runs import make_advice, parse_prior, runs_of
+from torchrl_priors.priors import BoltzmannPrior
 
-MANY = 20_000
-Q = torch.tensor([[2.0, -1.0], [0.5, 0.4], [9.0, 9.0], [1.0, 3.0], [-2.0, -3.0]]).repeat(1, 2)  # [5 states, 4 actions]
-VISITED = torch.tensor([True, True, False, True, True])
-
-
-def sampled(count: int, temperature: float = 1.0, worlds: int = MANY) -> torch.Tensor:
-    seeds = torch.arange(worlds)
-    return sample_degraded(Q.expand(worlds, 5, 4), VISITED.expand(worlds, 5), seeds, count, temperature)
+MANY = 10_000
+Q = np.tile([[2.0, -1.0], [0.5, 0.4], [9.0, 9.0], [1.0, 3.0], [-2.0, -3.0]], (1, 2))  # [5 states, 4 actions]
+VISITED = np.array([True, True, False, True, True])
 
 
-def within_chance(frequency: torch.Tensor, probability: torch.Tensor) -> bool:
-    return bool(((frequency - probability).abs() < 5 * (probability * (1 - probability) / MANY).sqrt() + 1e-9).all())
+def sampled(count: int, temperature: float = 1.0, seeds: int = MANY) -> np.ndarray:
+    prior = parse_prior(f"structural_{count}")
+    return np.stack([make_advice(prior, Q, VISITED, temperature, seed).degraded for seed in range(seeds)])
 
 
-def visited_softmax(temperature: float) -> torch.Tensor:
-    return torch.where(VISITED, Q.amax(-1) / temperature, -torch.inf).double().softmax(0)
+def within_chance(frequency, probability) -> bool:
+    return bool((np.abs(frequency - probability) < 5 * np.sqrt(probability * (1 - probability) / MANY) + 1e-9).all())
 
 
-@pytest.mark.parametrize("temperature", [0.5, 1.0, 4.0])
+def visited_softmax(temperature: float) -> np.ndarray:
+    exp = np.where(VISITED, np.exp(Q.max(-1) / temperature), 0.0)
+    return exp / exp.sum()
+
+
+@pytest.mark.parametrize("temperature", [0.5, 4.0])
 def test_first_degraded_state_is_drawn_from_the_softmax_of_the_visited_values(temperature):
     mask = sampled(1, temperature)
     assert (mask.sum(1) == 1).all()
-    assert within_chance(mask.double().mean(0), visited_softmax(temperature))
+    assert within_chance(mask.mean(0), visited_softmax(temperature))
 
 
 def test_degraded_states_are_those_of_drawing_until_enough_are_distinct():
     mask, p = sampled(2, 2.0), visited_softmax(2.0)
     assert (mask.sum(1) == 2).all()
     for one, other in combinations(range(5), 2):
-        expected = p[one] * p[other] / (1 - p[one]) + p[other] * p[one] / (1 - p[other])
-        assert within_chance((mask[:, one] & mask[:, other]).double().mean(), expected)
-    naive = torch.zeros(MANY, 5, dtype=torch.bool)
-    generator = torch.Generator().manual_seed(0)
-    while (few := naive.sum(1) < 2).any():
-        draw = torch.multinomial(p, int(few.sum()), replacement=True, generator=generator)
-        naive[few.nonzero().squeeze(1), draw] = True
-    difference = naive.double().mean(0) - mask.double().mean(0)
-    assert (difference.abs() < 5 * (0.5 / MANY) ** 0.5).all()
+        expected = 0.0 if 2 in (one, other) else p[one] * p[other] / (1 - p[one]) + p[other] * p[one] / (1 - p[other])
+        assert within_chance((mask[:, one] & mask[:, other]).mean(), expected)
 
 
 @pytest.mark.parametrize("count", [4, 5, 50])
 def test_world_with_too_few_visited_states_has_them_all_degraded(count):
-    assert torch.equal(sampled(count, worlds=3), VISITED.expand(3, 5))
+    assert np.array_equal(sampled(count, seeds=3), np.stack([VISITED] * 3))
 
 
-def test_degraded_states_depend_on_the_worlds_own_seed_alone():
-    q, visited, seeds = torch.randn(6, 30, 4), torch.ones(6, 30, dtype=torch.bool), torch.arange(6)
-    together = sample_degraded(q, visited, seeds, 5, 1.0)
-    for world in range(6):
-        alone = slice(world, world + 1)
-        assert torch.equal(sample_degraded(q[alone], visited[alone], seeds[alone], 5, 1.0), together[alone])
-    assert not torch.equal(sample_degraded(q, visited, seeds + 6, 5, 1.0), together)
+def test_degraded_states_depend_on_the_seed_and_on_their_number():
+    one, two = (make_advice(parse_prior("structural_2"), Q, VISITED, 9.0, seed).degraded for seed in (0, 0))
+    assert np.array_equal(one, two)
+    assert len({mask.tobytes() for mask in sampled(2, 9.0, seeds=20)}) > 1
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_broken_action_values_are_refused(value):
-    q = torch.zeros(2, 3, 4)
-    q[1, 2, 0] = value
-    with pytest.raises(ValueError, match="action values"):
-        sample_degraded(q, torch.ones(2, 3, dtype=torch.bool), torch.arange(2), 1, 1.0)
-
-
-def test_tables_hold_the_expert_its_adversary_and_each_degradation():
-    q = torch.randn(2, 7, 4, dtype=torch.float64).float()
-    masks = {3: torch.rand(2, 7) < 0.4, 5: torch.rand(2, 7) < 0.7}
-    table = advice_tables(q, masks, 0.5).view(2, 4, 7, ADVICE_WIDTH)
-    expert, adversary = (2 * q).log_softmax(-1), (-2 * q).log_softmax(-1)
-    torch.testing.assert_close(table[:, 0, :, :4], expert)
-    torch.testing.assert_close(table[:, 1, :, :4], adversary)
-    for index, mask in enumerate(masks.values(), 2):
-        torch.testing.assert_close(table[:, index, :, :4], torch.where(mask.unsqueeze(-1), adversary, expert))
-        assert torch.equal(table[:, index, :, 4], mask.float())
-    assert not table[:, :2, :, 4].any()
-
-
-def test_tables_of_a_world_do_not_depend_on_the_others():
-    q, mask = torch.randn(5, 25, 4), {3: torch.rand(5, 25) < 0.3}
-    together = advice_tables(q, mask, 1.0).view(5, -1)
-    for world in range(5):
-        assert torch.equal(advice_tables(q[world : world + 1], {3: mask[3][world : world + 1]}, 1.0), together[world])
+def test_advice_is_that_of_the_boltzmann_prior_and_its_adversary():
+    prior = BoltzmannPrior(torch.from_numpy(Q), 0.5)
+    states = TensorDict(state=torch.arange(5), batch_size=[5])
+    advice = make_advice(parse_prior("random_30"), Q, VISITED, 0.5, 0)
+    for mine, theirs in zip(advice.log_prob, (prior, prior.adversary()), strict=True):
+        np.testing.assert_allclose(mine, theirs.get_dist(states).logits.numpy(), rtol=1e-12)
+    np.testing.assert_allclose(advice.prob, np.exp(advice.log_prob))
+    assert (advice.degrade_prob, advice.degraded.any()) == (0.3, False)
+    assert make_advice(parse_prior("structural_2"), Q, VISITED, 0.5, 0).degrade_prob == 0
 
 
 @pytest.mark.parametrize(

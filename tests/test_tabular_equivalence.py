@@ -1,18 +1,18 @@
-"""The batched study and the TensorDict modules are one method: the same episode gives the same update."""
+"""The compiled study and the TensorDict modules are one method: the same episode gives the same update."""
 
 from __future__ import annotations
 
-from functools import cache
-
+import numpy as np
 import pytest
 import torch
-from tabular_cases import Step, Study, Tables, play, read_tables
+from tabular_cases import COEFFS, PRIORS, RATES, STATES, PlainStudent, Run, Visit, make_run, random_tables
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ReinforceLoss
 from torchrl.objectives.value import TD0Estimator
 
+from recipes import tabular, tabular_runs
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.lookup import StateTable
 from torchrl_priors.methods import METHODS, get_method
@@ -20,49 +20,28 @@ from torchrl_priors.objectives import AE2RLoss
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import BoltzmannPrior
 from torchrl_priors.schedules import CoeffScheduler, CosineSchedule
-from torchrl_priors.tabular import StudentConfig, runs_of
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
-PRIORS = ["expert", "random_30", "structural_3"]
-STEPS = 60
 
-
-@cache
-def recorded(td_error: str) -> tuple[Study, Tensor, list[Step], int]:
-    """Every method with every prior, from random tables on."""
-    study = Study.small(runs_of(list(METHODS), PRIORS), td_error=td_error)
-    first, history, _, runs = play(study, STEPS, random_tables=True)
-    return study, first, history, len(runs.key)
-
-
-def episodes_of(history: list[Step], row: int) -> list[list[Step]]:
-    """The steps of a row, an episode each; what does not end is left out."""
-    episodes: list[list[Step]] = [[]]
-    for step in history:
-        episodes[-1].append(step)
-        if step.done[row]:
-            episodes.append([])
-    return episodes[:-1]
-
-
-def as_batch(steps: list[Step], row: int) -> TensorDict:
+def as_batch(visits: list[Visit]) -> TensorDict:
     """An episode as a rollout would give it, and whose advice each step saw."""
-    fields = {name: torch.stack([getattr(step, name)[row] for step in steps]) for name in Step._fields[:7]}
-    done = fields["done"].unsqueeze(-1)
+    columns = (torch.tensor(column) for column in zip(*visits, strict=True))
+    state, action, reward, done, next_state, adverse, steps = columns
+    done = done.unsqueeze(-1)
     return TensorDict(
         {
-            "state": fields["state"],
-            "action": fields["action"],
-            "steps": fields["steps"],
-            "prior": {"degraded": fields["degraded"].unsqueeze(-1)},
+            "state": state,
+            "action": action,
+            "steps": steps,
+            "prior": {"degraded": adverse.unsqueeze(-1)},
             "next": {
-                "state": fields["next_state"],
-                "reward": fields["reward"].unsqueeze(-1),
+                "state": next_state,
+                "reward": reward.float().unsqueeze(-1),
                 "done": done,
                 "terminated": done.clone(),
             },
         },
-        [len(steps)],
+        [len(visits)],
         names=["time"],
     )
 
@@ -70,18 +49,20 @@ def as_batch(steps: list[Step], row: int) -> TensorDict:
 class Student:
     """The tabular student of one run, out of the library's modules and TorchRL's."""
 
-    def __init__(self, study: Study, method: str, prior: str, world: int, tables: Tables) -> None:
-        config, self.spec = study.config, get_method(method)
+    def __init__(self, run: Run, tables: tabular.Tables) -> None:
+        method, prior, td_error, self.spec = run.method, run.prior, run.td_error, get_method(run.method)
+        coeffs = {name: COEFFS[name] for name in ("bonus_coeff", "aux_coeff", "gamma")}
         self.logits, self.value, self.raw_value = (
-            nn.Parameter(table.clone()) for table in (tables.logits, *(v.unsqueeze(-1) for v in tables[1:3]))
+            nn.Parameter(torch.from_numpy(table).float())
+            for table in (tables.logits, tables.value[:, None], tables.raw_value[:, None])
         )
-        self.weight = PriorWeight.table(study.states)
+        self.weight = PriorWeight.table(STATES)
         self.weight_logits = self.weight.logit.table
-        self.weight_logits.data.copy_(tables.weight.unsqueeze(-1))
+        self.weight_logits.data.copy_(torch.from_numpy(tables.weight_logit[:, None]))
 
-        teacher = BoltzmannPrior(study.q[world], config.temperature)
+        teacher = BoltzmannPrior(torch.from_numpy(run.q).float(), 1.5)
         if prior.startswith("structural"):
-            teacher = StructuralDegradation(teacher, study.degraded[3][world])
+            teacher = StructuralDegradation(teacher, torch.from_numpy(run.advice.degraded))
         elif prior.startswith("random"):
             teacher = RandomDegradation(teacher, 0.3)
 
@@ -95,39 +76,33 @@ class Student:
             for table in (self.value, self.raw_value)
         )
         self.log_prob = PriorLogProb(teacher, boundary="zero")
-        self.bonus = PriorBonus.from_method(method, self.weight, bonus_coeff=config.bonus_coeff)
-        self.td_error = TD0Estimator(gamma=config.hyper.gamma, value_network=critic)
+        self.bonus = PriorBonus.from_method(method, self.weight, bonus_coeff=COEFFS["bonus_coeff"])
+        self.td_error = TD0Estimator(gamma=COEFFS["gamma"], value_network=critic)
         self.td_error.set_keys(reward="shaped_reward")
         self.policy_loss = ReinforceLoss(actor, critic, loss_critic_type="l2", reduction="sum")
         self.prior_loss = AE2RLoss(
             actor,
             teacher,
             self.weight,
-            raw_critic if config.td_error == "original" else critic,
+            raw_critic if td_error == "original" else critic,
             method=method,
-            td_error=config.td_error,
-            bonus_coeff=config.bonus_coeff,
-            aux_coeff=config.aux_coeff,
-            gamma=config.hyper.gamma,
+            td_error=td_error,
             reduction="sum",
+            **coeffs,
         )
         self.actor, self.schedule = actor, None
         if self.spec.annealed:
-            self.schedule = CoeffScheduler(self.prior_loss, "aux_coeff", self.annealing(config))
+            self.schedule = CoeffScheduler(
+                self.prior_loss, "aux_coeff", CosineSchedule(COEFFS["aux_coeff"], 0.2 * COEFFS["aux_coeff"], frames=40)
+            )
         # The gradient of a squared error is twice that of a TD(0) step.
-        self.critics = torch.optim.SGD([self.value, self.raw_value], lr=config.hyper.lr / 2)
+        self.critics = torch.optim.SGD([self.value, self.raw_value], lr=COEFFS["lr"] / 2)
         self.actor_and_weight = torch.optim.SGD(
             [
-                {"params": [self.logits], "lr": config.hyper.lr},
-                {"params": [self.weight_logits], "lr": config.lr_weight[self.spec.weight_target]},
+                {"params": [self.logits], "lr": COEFFS["lr"]},
+                {"params": [self.weight_logits], "lr": RATES[self.spec.weight_target]},
             ]
         )
-
-    @staticmethod
-    def annealing(config: StudentConfig) -> CosineSchedule:
-        schedule = config.hyper.schedule
-        assert isinstance(schedule, CosineSchedule)
-        return CosineSchedule(config.aux_coeff * schedule.start, config.aux_coeff * schedule.end, schedule.frames)
 
     def learn(self, episode: TensorDict) -> None:
         """One whole episode: critics online, actor and prior weight at its end."""
@@ -152,35 +127,38 @@ class Student:
                 self.prior_loss(step)["loss_prior_weight"].backward()
         self.actor_and_weight.step()
 
-    def tables(self) -> Tables:
-        return Tables(
-            self.logits.detach().clone(),
-            *(table.detach().squeeze(-1).clone() for table in (self.value, self.raw_value, self.weight_logits)),
-        )
+    def tables(self) -> dict[str, np.ndarray]:
+        tables = {"logits": self.logits, "value": self.value, "raw_value": self.raw_value}
+        tables["weight_logit"] = self.weight_logits
+        return {name: table.detach().squeeze(-1).double().numpy().copy() for name, table in tables.items()}
 
 
 @pytest.mark.parametrize("td_error", ["original", "shaped"])
 @pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("method", [method for method in METHODS if method != "none"])
-def test_batched_study_and_modules_give_the_same_update(method, prior, td_error):
-    study, first, history, rows = recorded(td_error)
-    row = study.row((method, prior))
-    spec = get_method(method)
-    student = Student(study, method, prior, 0, Tables(*(table[row] for table in read_tables(first, rows))))
-    episodes = episodes_of(history, row)
-    assert max(map(len, episodes)) > 2
-    before = student.tables()
-    for steps in episodes:
-        student.learn(as_batch(steps, row))
-        batched = Tables(*(table[row] for table in read_tables(steps[-1].records, rows)))
+def test_compiled_study_and_modules_give_the_same_update(method, prior, td_error):
+    run, spec = make_run(method, prior, 0, td_error), get_method(method)
+    tables = random_tables(run)
+    student, witness, lengths, steps = Student(run, tables), PlainStudent(run, tables), [], 0
+    before, rng, same = (
+        student.tables(),
+        tabular_runs.generator(5, method, prior),
+        tabular_runs.generator(5, method, prior),
+    )
+    for _ in range(6):
+        visits = witness.train_episode(same)  # says what the loop does next
+        steps = tabular.train_episode(run.world, run.advice, run.learner, tables, steps, rng)
+        assert steps == witness.steps
+        student.learn(as_batch(visits))
         theirs = student.tables()
-        torch.testing.assert_close(theirs.logits, batched.logits, rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(theirs.value, batched.value, rtol=1e-4, atol=1e-5)
-        if spec.adaptive:
-            torch.testing.assert_close(theirs.weight, batched.weight, rtol=1e-4, atol=1e-5)
-            if td_error == "original":
-                torch.testing.assert_close(theirs.raw_value, batched.raw_value, rtol=1e-4, atol=1e-5)
+        learned = ["logits", "value"] + ["weight_logit"] * spec.adaptive
+        learned += ["raw_value"] * (spec.adaptive and td_error == "original")
+        for name in learned:
+            np.testing.assert_allclose(theirs[name], getattr(tables, name), rtol=1e-4, atol=2e-5, err_msg=name)
+        lengths.append(len(visits))
     # The comparison saw something: every table that the method learns has moved.
-    assert (student.logits - before.logits).abs().max() > 0.1
-    assert (student.value.squeeze(-1) - before.value).abs().max() > 0.1
-    assert ((student.weight_logits.squeeze(-1) - before.weight).abs().max() > 1e-3) == spec.adaptive
+    assert max(lengths) > 2
+    moved = {name: np.abs(theirs[name] - before[name]).max() for name in theirs}
+    assert moved["logits"] > 0.1
+    assert moved["value"] > 0.1
+    assert (moved["weight_logit"] > 1e-3) == spec.adaptive

@@ -1,4 +1,4 @@
-"""A batch of grid worlds as one TorchRL environment, and the transition it shares with the batched study."""
+"""A batch of grid worlds as one TorchRL environment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_priors.envs.worlds import KINDS, GridWorlds, windows
-from torchrl_priors.random import derive_key, uniform
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,8 +82,8 @@ class GridWorldEnv(EnvBase):
 
     Keys: ``observation`` uint8 ``[W, window, window]`` (kinds of cells, see :data:`~torchrl_priors.envs.worlds.KINDS`),
     ``state`` int64 ``[W]`` (the number of the observation, for tables of ``C`` rows), ``position`` int64 ``[W]``,
-    ``action`` int64 ``[W]``, ``reward`` float32 ``[W, 1]``. Each world has random numbers of its own: what happens in
-    one depends on the seed and on its place in the batch, not on its neighbours.
+    ``action`` int64 ``[W]``, ``reward`` float32 ``[W, 1]``. Random numbers come from a CPU generator of its own, so
+    that a seed gives the same rollout on every device; the generator's state is part of the ``state_dict``.
 
     Args:
         worlds (GridWorlds): from :func:`~torchrl_priors.envs.worlds.sample_worlds`.
@@ -107,8 +106,6 @@ class GridWorldEnv(EnvBase):
     """
 
     batch_locked = True
-    key: Tensor
-    clock: Tensor
     start: Tensor
     view: Tensor
     next_position: Tensor
@@ -138,8 +135,7 @@ class GridWorldEnv(EnvBase):
         self.register_buffer("view", windows(self.worlds.kind, worlds.window).flatten(0, 1))
         offset = torch.arange(count, device=device) * self.worlds.num_cells
         self.register_buffer("start", self.worlds.start + offset)
-        self.register_buffer("key", torch.zeros(count, dtype=torch.int64, device=device))
-        self.register_buffer("clock", torch.zeros((), dtype=torch.int64, device=device))
+        self.generator = torch.Generator()
         cells = self.worlds.num_cells
         self.observation_spec = Composite(
             observation=Bounded(0, len(KINDS) - 1, (count, worlds.window, worlds.window), device, torch.uint8),
@@ -169,8 +165,7 @@ class GridWorldEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        slip, end, _, _ = uniform(self.key, self.clock)
-        self.clock += 1
+        slip, end = torch.rand(2, *self.batch_size, generator=self.generator).to(self.device)
         position, reward, terminated = transition(
             self.maps, tensordict["position"], tensordict["action"], slip, end, noise=self.noise, end_prob=self.end_prob
         )
@@ -189,8 +184,15 @@ class GridWorldEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             seed = int(torch.empty((), dtype=torch.int64).random_())
-        self.key = derive_key(seed, torch.arange(self.batch_size[0], device=self.device), "env")
-        self.clock = torch.zeros_like(self.clock)
+        self.generator.manual_seed(seed)
+
+    def get_extra_state(self) -> Tensor:
+        """The state of the random numbers."""
+        return self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restores it."""
+        self.generator.set_state(state.cpu())
 
     def render(self, world: int = 0, **overlays: Any) -> Figure:
         """Picture of one world: start, walls, terminal cells and rewards; returns a matplotlib figure.

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from tensordict import TensorClass
 from torch import Tensor
 from torch.nn import functional as F
-
-from torchrl_priors.random import derive_key, uniform
 
 __all__ = ["KINDS", "MOVES", "GridWorlds", "sample_worlds"]
 
@@ -154,14 +153,14 @@ def sample_worlds(
     for name, prob in (("wall_prob", wall_prob), ("object_prob", object_prob)):
         if not 0 <= prob <= 1:
             raise ValueError(f"{name} must be a probability, got {prob}.")
-    key = derive_key(seeds, "world").unsqueeze(-1)
-    draw = uniform(key, torch.arange(size * size, device=seeds.device))[0]
+    draws = [np.random.default_rng(seed % 2**64).random(size * size) for seed in seeds.tolist()]
+    draw = torch.from_numpy(np.stack(draws)).to(seeds.device)
     # One draw against the cumulated probabilities does what the sequence of Bernoulli draws does.
     bounds, left = [], 1.0
     for prob in (wall_prob, *[object_prob] * (len(KINDS) - 2)):
         left *= 1 - prob
         bounds.append(1 - left)
-    kind = torch.bucketize(draw, torch.tensor(bounds, device=seeds.device), right=True) + 1
+    kind = torch.bucketize(draw, torch.tensor(bounds, dtype=draw.dtype, device=seeds.device), right=True) + 1
     kind = torch.where(kind == len(KINDS), 0, kind)
     middle = size // 2 * size + size // 2
     kind[:, middle] = 0
