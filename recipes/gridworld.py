@@ -46,7 +46,7 @@ def sample_world(cfg: GridworldConfig, seed: int) -> GridWorlds:
     return sample_worlds(torch.tensor([seed]), **{name: cfg.world[name] for name in names})  # type: ignore[index]
 
 
-def make_learner(cfg: GridworldConfig, method: str) -> tabular.Learner:
+def make_learner(cfg: GridworldConfig, method: str) -> tabular_runs.Learner:
     """How the students of a method learn."""
     rates, budget = cfg.student.lr_weight, cfg.evaluation.points * cfg.evaluation.interval
     schedule = None
@@ -75,7 +75,7 @@ class TaughtWorld:
     def __init__(self, cfg: GridworldConfig, seed: int) -> None:
         self.cfg, self.seed = cfg, seed
         self.grid = sample_world(cfg, seed)
-        self.world = tabular.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
+        self.world = tabular_runs.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
         states, teacher = len(self.world.state), cfg.teacher
         self.q, self.visited = np.zeros((states, 4)), np.zeros(states, bool)
         rng = tabular_runs.generator(seed, "teacher")
@@ -97,13 +97,19 @@ class TaughtWorld:
             "reachable_goal": bool(self.grid.has_goal()),
         }
 
-    def advice(self, prior: str) -> tabular.Advice:
+    def advice(self, prior: str) -> tabular_runs.Advice:
         """What the prior of this name says."""
         spec = tabular_runs.parse_prior(prior or "expert")
         return tabular_runs.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
 
     def train(
-        self, method: str, prior: str, advice: tabular.Advice, learner: tabular.Learner, *, watch: bool = False
+        self,
+        method: str,
+        prior: str,
+        advice: tabular_runs.Advice,
+        learner: tabular_runs.Learner,
+        *,
+        watch: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The evaluation episodes of a student, ``[points, 8]``; its weights and visits at each if they are watched."""
         points, states = self.cfg.evaluation.points, len(self.world.state)
@@ -124,7 +130,7 @@ class TaughtWorld:
 
 
 def run_world(
-    cfg: GridworldConfig, seed: int, learners: dict[str, tabular.Learner], progress: Callable[[int], Any]
+    cfg: GridworldConfig, seed: int, learners: dict[str, tabular_runs.Learner], progress: Callable[[int], Any]
 ) -> dict[str, Any]:
     """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 8]``."""
     taught = TaughtWorld(cfg, seed)

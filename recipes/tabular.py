@@ -6,26 +6,16 @@ GIL, so that threads run one world each.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
-from torchrl_priors.envs import GridWorlds
+if TYPE_CHECKING:  # Numba looks at the values themselves
+    from recipes.tabular_runs import Advice, Learner, Tables, World
 
-__all__ = [
-    "LOG_FIELDS",
-    "Advice",
-    "Learner",
-    "Tables",
-    "World",
-    "arrive",
-    "best_action",
-    "play_episode",
-    "step",
-    "teach",
-]
-__all__ += ["teacher_episode", "train", "train_episode"]
+__all__ = ["LOG_FIELDS", "arrive", "best_action", "play_episode", "step", "teach", "teacher_episode", "train"]
+__all__ += ["train_episode"]
 
 #: What is kept of every evaluation episode: return and length; sum, sum of squares and number of the prior weights
 #: at visits of degraded states; the same at the other states.
@@ -37,33 +27,6 @@ compiled = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)
 
 
 # -- The world ---------------------------------------------------------------------------------------------------------
-
-
-class World(NamedTuple):
-    """One of the library's :class:`~torchrl_priors.envs.GridWorlds` as arrays, and how it behaves."""
-
-    next_cell: np.ndarray
-    """int64 ``[C, 4]``."""
-    reward: np.ndarray
-    """float64 ``[C]``, paid on arrival."""
-    terminal: np.ndarray
-    """bool ``[C]``."""
-    state: np.ndarray
-    """int64 ``[C]``, the row of the cell's observation in every table."""
-    start: int
-    noise: float
-    """Probability that a uniform action replaces the agent's."""
-    end_prob: float
-    """Probability that a step ends the episode."""
-
-    @classmethod
-    def of(cls, world: GridWorlds, noise: float, end_prob: float) -> World:
-        """From a batch of one world."""
-        tables = (getattr(world, name)[0].numpy() for name in ("next_cell", "reward", "terminal", "state"))
-        next_cell, reward, terminal, state = tables
-        return cls(
-            next_cell, reward.astype(np.float64), terminal, state, int(world.start), float(noise), float(end_prob)
-        )
 
 
 @compiled
@@ -134,71 +97,7 @@ def teacher_episode(world: World, q: np.ndarray, rng: np.random.Generator) -> tu
     return total, length
 
 
-class Advice(NamedTuple):
-    """What a student's prior says."""
-
-    log_prob: np.ndarray
-    """``[2, C, 4]``: of the teacher, softmax(Q / temperature), and of its adversary, softmax(-Q / temperature)."""
-    prob: np.ndarray
-    """The same as probabilities."""
-    degraded: np.ndarray
-    """bool ``[C]``, the states where the adversary always answers."""
-    degrade_prob: float
-    """Probability that it answers at a visited step."""
-
-
 # -- The student -------------------------------------------------------------------------------------------------------
-
-
-class Learner(NamedTuple):
-    """How a student learns: a method's preset with the coefficients of the study."""
-
-    gamma: float
-    lr: float
-    """Of the actor and both critics."""
-    lr_weight: float
-    bonus_current: float
-    """Coefficient of the bonus on the action taken."""
-    bonus_next: float
-    """Coefficient of the bonus on the action after it."""
-    relative: bool
-    """Whether the bonus is relative to the student's log-probability."""
-    aux_coeff: float
-    teacher_mean: bool
-    """Whether the auxiliary loss averages over the teacher's actions (else over the student's)."""
-    adaptive: bool
-    """Whether the prior weight is learned (else 1)."""
-    by_advantage: bool
-    """Whether it regresses on the advantage (else on the TD error)."""
-    shaped: bool
-    """Whether that TD error is of the critic that sees the bonus."""
-    schedule: np.ndarray
-    """Factor on bonus and auxiliary loss after so many training transitions; the last entry holds from there on."""
-
-
-class Tables(NamedTuple):
-    """What a student has learned, by state. Policy and weight change at the end of an episode, the critics at once."""
-
-    logits: np.ndarray
-    """``[C, 4]``."""
-    policy: np.ndarray
-    """Their softmax."""
-    value: np.ndarray
-    """``[C]``, the critic that sees the bonus."""
-    raw_value: np.ndarray
-    """The one that never does."""
-    weight_logit: np.ndarray
-    weight: np.ndarray
-    """Their sigmoid."""
-    policy_gradient: np.ndarray
-    """``[C, 4]``, summed over the episode."""
-    weight_gradient: np.ndarray
-    visits: np.ndarray
-    """int64 ``[C]``, training transitions from each state so far."""
-    last: np.ndarray
-    """int64 ``[C]``, the number of the last of them."""
-    path: np.ndarray
-    """int64 ``[C]``, the distinct states of the episode, in the order of their first visit."""
 
 
 @compiled

@@ -9,10 +9,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recipes.tabular import Advice, Learner, Tables
+from torchrl_priors.envs import GridWorlds
 from torchrl_priors.methods import get_method
 
-__all__ = ["PriorSpec", "generator", "learner_of", "make_advice", "new_tables", "parse_prior", "runs_of"]
+__all__ = [
+    "Advice",
+    "Learner",
+    "PriorSpec",
+    "Tables",
+    "World",
+    "generator",
+    "learner_of",
+    "make_advice",
+    "new_tables",
+    "parse_prior",
+    "runs_of",
+]
 
 
 def generator(seed: int, *names: str) -> np.random.Generator:
@@ -26,6 +38,36 @@ def generator(seed: int, *names: str) -> np.random.Generator:
     """
     words = tuple(zlib.crc32(name.encode()) for name in names)
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=words)))
+
+
+class World(NamedTuple):
+    """One of the library's :class:`~torchrl_priors.envs.GridWorlds` as arrays, and how it behaves.
+
+    Attributes:
+        next_cell: int64 ``[C, 4]``.
+        reward: float64 ``[C]``, paid on arrival.
+        terminal: bool ``[C]``.
+        state: int64 ``[C]``, the row of the cell's observation in every table.
+        noise: probability that a uniform action replaces the agent's.
+        end_prob: probability that a step ends the episode.
+    """
+
+    next_cell: np.ndarray
+    reward: np.ndarray
+    terminal: np.ndarray
+    state: np.ndarray
+    start: int
+    noise: float
+    end_prob: float
+
+    @classmethod
+    def of(cls, world: GridWorlds, noise: float, end_prob: float) -> World:
+        """From a batch of one world."""
+        tables = (getattr(world, name)[0].numpy() for name in ("next_cell", "reward", "terminal", "state"))
+        next_cell, reward, terminal, state = tables
+        return cls(
+            next_cell, reward.astype(np.float64), terminal, state, int(world.start), float(noise), float(end_prob)
+        )
 
 
 class PriorSpec(NamedTuple):
@@ -67,6 +109,21 @@ def runs_of(methods: Sequence[str], priors: Sequence[str]) -> list[tuple[str, st
     return [(method, prior) for method in methods for prior in ([""] if method == "none" else priors)]
 
 
+class Advice(NamedTuple):
+    """What a student's prior says.
+
+    Attributes:
+        log_prob: ``[2, C, 4]``, of the teacher, softmax(Q / temperature), and its adversary, softmax(-Q / temperature).
+        prob: the same as probabilities.
+        degraded: bool ``[C]``, the states where the adversary always answers.
+    """
+
+    log_prob: np.ndarray
+    prob: np.ndarray
+    degraded: np.ndarray
+    degrade_prob: float
+
+
 def make_advice(prior: PriorSpec, q: np.ndarray, visited: np.ndarray, temperature: float, seed: int) -> Advice:
     """The teacher's advice, degraded.
 
@@ -83,6 +140,34 @@ def make_advice(prior: PriorSpec, q: np.ndarray, visited: np.ndarray, temperatur
         degraded[np.argsort(-score)[: prior.structural]] = True
     log_prob = logits - np.log(np.exp(logits).sum(-1, keepdims=True))
     return Advice(log_prob, np.exp(log_prob), degraded & visited, prior.random)
+
+
+class Learner(NamedTuple):
+    """How a student learns: a method's preset with the coefficients of the study.
+
+    Attributes:
+        lr: of the actor and both critics.
+        bonus_current: coefficient of the bonus on the action taken.
+        bonus_next: coefficient of the bonus on the action after it.
+        relative: whether the bonus is relative to the student's log-probability.
+        teacher_mean: whether the auxiliary loss averages over the teacher's actions (else over the student's).
+        adaptive: whether the prior weight is learned (else 1).
+        by_advantage: whether it regresses on the advantage (else on the TD error).
+        shaped: whether that TD error is of the critic that sees the bonus.
+    """
+
+    gamma: float
+    lr: float
+    lr_weight: float
+    bonus_current: float
+    bonus_next: float
+    relative: bool
+    aux_coeff: float
+    teacher_mean: bool
+    adaptive: bool
+    by_advantage: bool
+    shaped: bool
+    schedule: np.ndarray
 
 
 def learner_of(
@@ -112,6 +197,33 @@ def learner_of(
         shaped=td_error == "shaped",
         schedule=np.ones(1) if schedule is None else schedule,
     )
+
+
+class Tables(NamedTuple):
+    """What a student has learned, by state. Policy and weight change at the end of an episode, the critics at once.
+
+    Attributes:
+        logits: ``[C, 4]``.
+        policy: their softmax.
+        value: ``[C]``, the critic that sees the bonus.
+        raw_value: the one that never does.
+        weight: their sigmoid.
+        policy_gradient: ``[C, 4]``, summed over the episode.
+        visits: int64 ``[C]``, training transitions from each state so far.
+        last: int64 ``[C]``, the number of the last of them.
+    """
+
+    logits: np.ndarray
+    policy: np.ndarray
+    value: np.ndarray
+    raw_value: np.ndarray
+    weight_logit: np.ndarray
+    weight: np.ndarray
+    policy_gradient: np.ndarray
+    weight_gradient: np.ndarray
+    visits: np.ndarray
+    last: np.ndarray
+    path: np.ndarray
 
 
 def new_tables(states: int, adaptive: bool) -> Tables:

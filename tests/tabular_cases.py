@@ -46,10 +46,10 @@ class Run(NamedTuple):
     prior: str
     world_index: int
     td_error: str
-    world: tabular.World
+    world: tabular_runs.World
     q: np.ndarray
-    advice: tabular.Advice
-    learner: tabular.Learner
+    advice: tabular_runs.Advice
+    learner: tabular_runs.Learner
 
 
 def make_run(method: str, prior: str, world: int = 0, td_error: str = "original", end_prob: float = 0.06) -> Run:
@@ -62,11 +62,11 @@ def make_run(method: str, prior: str, world: int = 0, td_error: str = "original"
         schedule=SCHEDULE if get_method(method).annealed else None,
         **COEFFS,
     )
-    where = tabular.World.of(drawn_worlds()[world : world + 1], 0.1, end_prob)
+    where = tabular_runs.World.of(drawn_worlds()[world : world + 1], 0.1, end_prob)
     return Run(method, prior, world, td_error, where, q, advice, learner)
 
 
-def random_tables(run: Run) -> tabular.Tables:
+def random_tables(run: Run) -> tabular_runs.Tables:
     """In the middle of learning."""
     tables, rng = tabular_runs.new_tables(STATES, run.learner.adaptive), np.random.default_rng(3)
     for table in (tables.logits, tables.value, tables.raw_value):
@@ -124,7 +124,7 @@ def sigmoid(value: float) -> float:
 class PlainStudent:
     """The tabular student in dictionaries and plain Python; of the compiled loop it shares only the order of draws."""
 
-    def __init__(self, run: Run, tables: tabular.Tables | None = None) -> None:
+    def __init__(self, run: Run, tables: tabular_runs.Tables | None = None) -> None:
         self.run, self.spec = run, get_method(run.method)
         self.world = PlainWorld(run.world_index, run.world.end_prob)
         self.teacher = [np.log(softmax(values / 1.5)) for values in run.q]
@@ -224,7 +224,7 @@ class PlainStudent:
                 episode[name] += amount
         return list(episode.values())
 
-    def assert_same(self, tables: tabular.Tables) -> None:
+    def assert_same(self, tables: tabular_runs.Tables) -> None:
         pairs = [("logits", self.logits), ("value", self.value), ("raw_value", self.raw_value)]
         for name, mine in [*pairs, ("weight_logit", self.weight_logit)]:
             expected = np.array([mine[state] for state in range(STATES)])

@@ -110,7 +110,7 @@ def test_the_loops_step_is_that_of_the_environment():
     theirs = transition(maps, position, action, *draws, noise=noise, end_prob=end_prob)
     assert set(theirs[1].unique().tolist()) == {0.0, 10.0, -10.0, 5.0, -5.0, 1.0, -1.0}
     for world in range(3):
-        here = tabular.World.of(worlds[world : world + 1], noise, end_prob)
+        here = tabular_runs.World.of(worlds[world : world + 1], noise, end_prob)
         for cell in range(STATES):
             for move in range(4):
                 for draw in range(20):

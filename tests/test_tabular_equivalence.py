@@ -49,7 +49,7 @@ def as_batch(visits: list[Visit]) -> TensorDict:
 class Student:
     """The tabular student of one run, out of the library's modules and TorchRL's."""
 
-    def __init__(self, run: Run, tables: tabular.Tables) -> None:
+    def __init__(self, run: Run, tables: tabular_runs.Tables) -> None:
         method, prior, td_error, self.spec = run.method, run.prior, run.td_error, get_method(run.method)
         coeffs = {name: COEFFS[name] for name in ("bonus_coeff", "aux_coeff", "gamma")}
         self.logits, self.value, self.raw_value = (
