@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import (
+    AddStateIndependentNormalScale,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -17,7 +18,9 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import IndependentNormal, SafeModule, SafeProbabilisticModule
+from torchrl.modules import MLP, IndependentNormal, SafeModule, SafeProbabilisticModule
+
+from torchrl_priors.networks import ACTIVATIONS, GaussianMLP
 
 __all__ = ["GaussianStep", "ModuleStep", "PolicyStep", "policy_step"]
 
@@ -43,7 +46,7 @@ class PolicyStep(ABC):
 
     @abstractmethod
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-        """What the policy writes for the observations of one step, by key, each ``[N, ...]``."""
+        """What the policy writes for the observations of one step, by key, each ``[N, ...]``, until the next call."""
 
     @abstractmethod
     def complete(self, batch: TensorDictBase) -> None:
@@ -83,7 +86,8 @@ class GaussianStep(PolicyStep):
     """A diagonal Gaussian policy made of plain modules: they are called directly, on tensors.
 
     The noise is drawn for many steps at once, and the log-probabilities are computed for a whole batch: both give what
-    the policy itself would give, with other random numbers.
+    the policy itself would give, with other random numbers. Of a dense network, with the same standard deviation in
+    every state, on the CPU, not even the modules are called.
     """
 
     def __init__(
@@ -100,16 +104,28 @@ class GaussianStep(PolicyStep):
         self._generator: torch.Generator | None = None
         self._noise: Iterator[Tensor] = iter(())
         self._deterministic = False
+        self._dense: _DenseGaussian | None = None
 
     @contextmanager
     def session(self, generator: torch.Generator, deterministic: bool) -> Iterator[None]:
         """See :class:`PolicyStep`."""
         self._generator, self._noise, self._deterministic = generator, iter(()), deterministic
+        self._dense = self._find_dense() if generator.device.type == "cpu" else None  # parameters and hooks may change
         with torch.no_grad():
             yield
 
+    def _find_dense(self) -> _DenseGaussian | None:
+        (module, in_keys, out_keys), *more = self._body
+        if more or len(in_keys) != 1 or out_keys != (self._loc, self._scale):
+            return None
+        return _DenseGaussian.of(module)
+
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
         """See :class:`PolicyStep`."""
+        if self._dense is not None and (observation := inputs[self.policy.in_keys[0]]).ndim == 2:
+            loc, scale = self._dense(observation)
+            action = loc if self._deterministic else self._dense.add(loc, self._next_noise(loc, scale))
+            return {self._loc: loc, self._scale: scale, self.action_key: action}
         values = dict(inputs)
         for module, in_keys, out_keys in self._body:
             out = module(*[values[key] for key in in_keys])
@@ -122,11 +138,12 @@ class GaussianStep(PolicyStep):
             del values[key]
         return values
 
-    def _next_noise(self, like: Tensor) -> Tensor:
+    def _next_noise(self, like: Tensor, scale: Tensor | None = None) -> Tensor:
+        """Standard normal numbers of the next step, times a scale that is that of all steps."""
         noise = next(self._noise, None)
         if noise is None:
             draws = torch.randn((_CHUNK, *like.shape), generator=self._generator, dtype=like.dtype, device=like.device)
-            self._noise = iter(draws.unbind(0))
+            self._noise = iter((draws if scale is None else draws * scale).unbind(0))
             noise = next(self._noise)
         return noise
 
@@ -136,6 +153,90 @@ class GaussianStep(PolicyStep):
             with torch.no_grad():
                 distribution = self._head.get_dist(batch)
                 batch.set(self._head.log_prob_key, distribution.log_prob(batch.get(self.action_key)))
+
+
+class _DenseGaussian:
+    """The operations of a dense network and of a state-independent scale, on memory that stays.
+
+    Args:
+        linears (list of Linear): the layers.
+        activations (list of Module, optional): what follows each of them, if anything does.
+        scale (AddStateIndependentNormalScale): the last layer.
+    """
+
+    def __init__(
+        self,
+        linears: list[nn.Linear],
+        activations: list[nn.Module | None],
+        scale: AddStateIndependentNormalScale,
+    ) -> None:
+        self._steps: list[tuple[Tensor, Tensor, Tensor, Callable[[Tensor], Tensor] | None]] = []
+        for linear, activation in zip(linears, activations, strict=True):
+            weight = linear.weight.detach()
+            bias = weight.new_zeros(linear.out_features) if linear.bias is None else linear.bias.detach()
+            function = None if activation is None else _IN_PLACE.get(type(activation), activation.forward)
+            self._steps.append((bias, weight.t(), weight.new_empty(0), function))  # an empty tensor grows, once
+        self._scale_layer = scale
+        self._scale: Tensor | None = None
+        self._sum = weight.new_empty(0)
+
+    @classmethod
+    def of(cls, module: nn.Module) -> _DenseGaussian | None:
+        """That of a module; None if there is more to it."""
+        layers = _layers(module)
+        if layers is None or not layers or not isinstance(scale := layers.pop(), AddStateIndependentNormalScale):
+            return None
+        linears: list[nn.Linear] = []
+        activations: list[nn.Module | None] = []
+        for layer in layers:
+            if isinstance(layer, nn.Linear):
+                linears.append(layer)
+                activations.append(None)
+            elif type(layer) in ACTIVATIONS.values() and activations and activations[-1] is None:
+                activations[-1] = layer
+            else:
+                return None
+        return cls(linears, activations, scale) if linears else None
+
+    def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation at ``x``, ``[N, features]``, until the next call."""
+        for bias, weight, out, activation in self._steps:
+            x = torch.addmm(bias, x, weight, out=out)
+            if activation is not None:
+                x = activation(x)
+        if self._scale is None:
+            _, scale = self._scale_layer(x)
+            self._scale = scale.contiguous()
+        return x, self._scale
+
+    def add(self, loc: Tensor, noise: Tensor) -> Tensor:
+        """Their sum, until the next call."""
+        return torch.add(loc, noise, out=self._sum)
+
+
+_IN_PLACE: dict[type[nn.Module], Callable[[Tensor], Tensor]] = {nn.Tanh: torch.tanh_, nn.ReLU: torch.relu_}
+
+
+def _layers(module: nn.Module) -> list[nn.Module] | None:
+    """The layers of a dense network, one after the other; None if a module may do more than its class says."""
+    if _has_hooks(module) or "forward" in vars(module):
+        return None
+    if type(module) is GaussianMLP:
+        children: list[nn.Module] = [module.mean, module.scale]
+    elif isinstance(module, nn.Sequential) and type(module) in (nn.Sequential, MLP):
+        if getattr(module, "_reshape_out", False):
+            return None
+        children = list(module)
+    else:
+        plain = (nn.Linear, AddStateIndependentNormalScale, *ACTIVATIONS.values())
+        return [module] if type(module) in plain else None
+    layers: list[nn.Module] = []
+    for child in children:
+        found = _layers(child)
+        if found is None:
+            return None
+        layers += found
+    return layers
 
 
 def policy_step(policy: TensorDictModuleBase, action_key: NestedKey, input_keys: Sequence[NestedKey]) -> PolicyStep:

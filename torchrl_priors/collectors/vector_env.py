@@ -35,15 +35,14 @@ def make_vector_env(env_id: str, num_envs: int, **kwargs: Any) -> SyncVectorEnv:
         raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
     try:
         import gymnasium
-        from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+        from torchrl_priors.collectors.mujoco_vector_env import MujocoVectorEnv
     except ImportError as error:
         raise ImportError(
             "make_vector_env needs Gymnasium: install the extra 'mujoco' (pip install 'torchrl-priors[mujoco]')."
         ) from error
     with _quiet_mujoco():
-        return SyncVectorEnv(
-            [lambda: gymnasium.make(env_id, **kwargs)] * num_envs, autoreset_mode=AutoresetMode.DISABLED
-        )
+        return MujocoVectorEnv([lambda: gymnasium.make(env_id, **kwargs)] * num_envs)
 
 
 @contextmanager
