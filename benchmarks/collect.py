@@ -5,9 +5,9 @@
 
 One process and one thread; frames per second of CPU time. The contenders take turns, so that whatever else the machine
 does hits them alike: ``mj_step`` alone on the models of the environments (resets and all else are not timed), the
-vector of environments of this library and Gymnasium's, and ``VectorCollector`` with the recipe's actor, untrained, and a
-normaliser. All take standard normal actions, clipped, which are about what such an actor draws: episodes are short, and
-resets as frequent as they get. A ratio is the median over rounds of a ratio within a round.
+vector of environments of this library and Gymnasium's, and ``VectorCollector`` with the recipe's actor, untrained, and
+a normaliser. All take standard normal actions, clipped, which are about what such an actor draws: episodes are short,
+and resets as frequent as they get. A ratio is the median over rounds of a ratio within a round.
 """
 
 from __future__ import annotations
