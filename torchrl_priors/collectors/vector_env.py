@@ -18,8 +18,8 @@ __all__ = ["check_vector_env", "make_vector_env", "spread_seed"]
 def make_vector_env(env_id: str, num_envs: int, **kwargs: Any) -> SyncVectorEnv:
     """A :class:`gymnasium.vector.SyncVectorEnv` that does not reset by itself: its last observations are the true ones.
 
-    HalfCheetah, Hopper, Walker2d, Ant and Humanoid (v4, v5) take the same steps, to the bit, faster: their observations,
-    rewards and ends are computed for all environments at once, and the infos of their steps are empty.
+    HalfCheetah, Hopper, Walker2d, Ant and Humanoid (v4, v5) take the same steps, to the bit, faster: observations,
+    rewards and ends are computed for all environments at once, and the infos of steps are empty.
 
     The models of some environments use features that MuJoCo deprecates. These notices, which MuJoCo would print and
     append to a file in the working directory, are dropped while the environments are built; its other warnings become
