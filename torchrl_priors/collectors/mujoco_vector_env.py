@@ -49,6 +49,8 @@ class MujocoVectorEnv(SyncVectorEnv):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """See :class:`gymnasium.vector.SyncVectorEnv`."""
+        if self._task is not None:
+            self._task.dt = self._task.base.dt
         if self._steps:  # the superclass's observations of those that are not reset
             self._env_obs = list(self._observations.copy())
         return super().reset(seed=seed, options=options)
@@ -60,7 +62,7 @@ class MujocoVectorEnv(SyncVectorEnv):
             return super().step(actions)
         if self._steps < _CHECKED_STEPS:
             return self._checked_step(task, actions)
-        assert not self._autoreset_envs.any(), "An episode that ended has to be reset first."
+        assert True not in self._autoreset_envs.tolist(), "An episode that ended has to be reset first."
         task.before()
         for base, action in zip(task.bases, actions, strict=True):
             base._step_mujoco_simulation(action, base.frame_skip)
@@ -143,7 +145,7 @@ def _clip(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 def _cost(weight: float, values: np.ndarray) -> np.ndarray:
     """``weight * np.sum(np.square(row))`` of each row, in the order of summation and the precision of a single one."""
-    sums = np.square(values, order="C").sum(axis=-1)
+    sums = np.add.reduce(np.square(values, order="C"), axis=-1)
     dtype = (weight * sums[0]).dtype  # that of scalars, which depends on the version of NumPy
     return sums.astype(dtype, copy=False) * dtype.type(weight)
 
@@ -157,6 +159,7 @@ class _Task:
     def __init__(self, bases: list[Any], version: int) -> None:
         self.bases, self.version = bases, version
         self.base = bases[0]  # its settings are those of all
+        self.dt: float = self.base.dt
         skipped = self.skipped * bool(self.base._exclude_current_positions_from_observation)
         rows = [[base.data.qpos[skipped:], base.data.qvel, *self.observed(base)] for base in bases]
         self.positions = sum(array.size for array in rows[0][:1])
@@ -193,7 +196,7 @@ class _Task:
         """Observations, rewards and which episodes terminated, after a step."""
         obs = self._obs()
         self.limit(obs)
-        gains, terminated = self.gains(((self.place() - self._start) / self.base.dt)[:, 0])
+        gains, terminated = self.gains(((self.place() - self._start) / self.dt)[:, 0])
         return obs, gains - self.costs(actions), terminated
 
     def agrees(self, step: _Step, actions: np.ndarray) -> bool:

@@ -46,7 +46,10 @@ class PolicyStep(ABC):
 
     @abstractmethod
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-        """What the policy writes for the observations of one step, by key, each ``[N, ...]``, until the next call."""
+        """What the policy writes for the observations of one step, by key, each ``[N, ...]``.
+
+        The next call of a session may write the same tensors again; then it returns the same dict.
+        """
 
     @abstractmethod
     def complete(self, batch: TensorDictBase) -> None:
@@ -105,12 +108,14 @@ class GaussianStep(PolicyStep):
         self._noise: Iterator[Tensor] = iter(())
         self._deterministic = False
         self._dense: _DenseGaussian | None = None
+        self._outputs: dict[NestedKey, Tensor] = {}  # of a session, written again in each step
 
     @contextmanager
     def session(self, generator: torch.Generator, deterministic: bool) -> Iterator[None]:
         """See :class:`PolicyStep`."""
         self._generator, self._noise, self._deterministic = generator, iter(()), deterministic
         self._dense = self._find_dense() if generator.device.type == "cpu" else None  # parameters and hooks may change
+        self._outputs = {}
         with torch.no_grad():
             yield
 
@@ -123,9 +128,7 @@ class GaussianStep(PolicyStep):
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
         """See :class:`PolicyStep`."""
         if self._dense is not None and (observation := inputs[self.policy.in_keys[0]]).ndim == 2:
-            loc, scale = self._dense(observation)
-            action = loc if self._deterministic else self._dense.add(loc, self._next_noise(loc, scale))
-            return {self._loc: loc, self._scale: scale, self.action_key: action}
+            return self._call_dense(self._dense, observation)
         values = dict(inputs)
         for module, in_keys, out_keys in self._body:
             out = module(*[values[key] for key in in_keys])
@@ -137,6 +140,15 @@ class GaussianStep(PolicyStep):
         for key in inputs:
             del values[key]
         return values
+
+    def _call_dense(self, dense: _DenseGaussian, observation: Tensor) -> dict[NestedKey, Tensor]:
+        loc, scale = dense(observation)
+        if not self._outputs:
+            action = loc if self._deterministic else torch.empty_like(loc)
+            self._outputs = {self._loc: loc, self._scale: scale, self.action_key: action}
+        if not self._deterministic:
+            torch.add(loc, self._next_noise(loc, scale), out=self._outputs[self.action_key])
+        return self._outputs
 
     def _next_noise(self, like: Tensor, scale: Tensor | None = None) -> Tensor:
         """Standard normal numbers of the next step, times a scale that is that of all steps."""
@@ -178,7 +190,6 @@ class _DenseGaussian:
             self._steps.append((bias, weight.t(), weight.new_empty(0), function))  # an empty tensor grows, once
         self._scale_layer = scale
         self._scale: Tensor | None = None
-        self._sum = weight.new_empty(0)
 
     @classmethod
     def of(cls, module: nn.Module) -> _DenseGaussian | None:
@@ -199,7 +210,7 @@ class _DenseGaussian:
         return cls(linears, activations, scale) if linears else None
 
     def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation at ``x``, ``[N, features]``, until the next call."""
+        """Mean and standard deviation at ``x``, ``[N, features]``; the same tensors in each call."""
         for bias, weight, out, activation in self._steps:
             x = torch.addmm(bias, x, weight, out=out)
             if activation is not None:
@@ -208,10 +219,6 @@ class _DenseGaussian:
             _, scale = self._scale_layer(x)
             self._scale = scale.contiguous()
         return x, self._scale
-
-    def add(self, loc: Tensor, noise: Tensor) -> Tensor:
-        """Their sum, until the next call."""
-        return torch.add(loc, noise, out=self._sum)
 
 
 _IN_PLACE: dict[type[nn.Module], Callable[[Tensor], Tensor]] = {nn.Tanh: torch.tanh_, nn.ReLU: torch.relu_}
