@@ -259,6 +259,7 @@ class TestPolicy:
             [nn.Tanh(), nn.Linear(3, 2)],
             [nn.utils.parametrizations.weight_norm(nn.Linear(3, 2))],
             [nn.utils.spectral_norm(nn.Linear(3, 2))],  # a hook
+            [nn.Linear(3, 300), nn.Linear(300, 200), nn.Linear(200, 2)],  # too large
             [nn.Sequential(nn.Linear(3, 4, bias=False), nn.ReLU()), nn.Linear(4, 2)],
             [MLP(3, 2, num_cells=[4])],
         ],
