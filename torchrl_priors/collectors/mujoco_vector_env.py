@@ -222,20 +222,28 @@ class _HalfCheetah(_Task):
 
 
 class _Walker2d(_Task):
+    def __init__(self, bases: list[Any], version: int) -> None:
+        super().__init__(bases, version)
+        self._low, self._high = np.array(self.bounds(), np.float64).T
+
+    def bounds(self) -> list[tuple[float, float]]:
+        """Of healthy states, from their second coordinate on."""
+        return [self.base._healthy_z_range, self.base._healthy_angle_range]
+
     def limit(self, obs: np.ndarray) -> None:
         _clip(obs[:, self.positions :], -10.0, 10.0)
 
     def healthy(self, state: np.ndarray) -> np.ndarray:
-        (low, high), (left, right) = self.base._healthy_z_range, self.base._healthy_angle_range
-        height, angle = state[:, 1], state[:, 2]
-        return (low < height) & (height < high) & (left < angle) & (angle < right)
+        bounded = state[:, 1 : 1 + len(self._low)]
+        return np.logical_and.reduce((self._low < bounded) & (bounded < self._high), axis=1)
 
 
 class _Hopper(_Walker2d):
-    def healthy(self, state: np.ndarray) -> np.ndarray:
+    def bounds(self) -> list[tuple[float, float]]:
+        height, (left, right) = super().bounds()
         low, high = self.base._healthy_state_range
-        inner = state[:, 2:]
-        return super().healthy(state) & ((low < inner) & (inner < high)).all(axis=1)
+        others = self.base.model.nq + self.base.model.nv - 3
+        return [height, (max(low, left), min(high, right)), *[(low, high)] * others]
 
 
 class _Ant(_Task):
