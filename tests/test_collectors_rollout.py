@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,18 @@ pytest.importorskip("gymnasium")
 from collectors_cases import deterministic, gaussian, same, scripts, squashed
 from gymnasium.vector import AutoresetMode
 from tensordict import TensorDictBase
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper, RewardSum, StepCounter, TransformedEnv
 from torchrl.envs.transforms import Compose, DoubleToFloat
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 from torchrl.objectives.value import GAE
 
 from torchrl_priors import ActionPrior, PriorLogProb
 from torchrl_priors.collectors import RunningNorm, VectorCollector, make_vector_env
 from torchrl_priors.collectors.policy_step import GaussianStep, ModuleStep, policy_step
-from torchrl_priors.networks import make_critic
+from torchrl_priors.networks import ACTIVATIONS, make_actor, make_critic
 
 LENGTHS = [(2, 3), (4,), (5, 1)]
 
@@ -32,6 +36,23 @@ def collector(policy: Any = None, *, frames: int = 24, **kwargs: Any) -> VectorC
     kwargs.setdefault("seed", 0)
     env = kwargs.pop("env", None) or scripts(*LENGTHS)
     return VectorCollector(env, policy or gaussian(3, 2), frames_per_batch=frames, **kwargs)
+
+
+@contextmanager
+def calls(net: nn.Module) -> Iterator[list[nn.Module]]:
+    """What is called of a network, by a hook that nobody sees."""
+    called: list[nn.Module] = []
+    known = set(net.modules())
+
+    def remember(module: nn.Module, *_: Any) -> None:
+        if module in known and not isinstance(module, AddStateIndependentNormalScale):  # called once a rollout
+            called.append(module)
+
+    handle = nn.modules.module.register_module_forward_hook(remember)
+    try:
+        yield called
+    finally:
+        handle.remove()
 
 
 def noise(batch: TensorDictBase) -> torch.Tensor:
@@ -206,6 +227,65 @@ class TestPolicy:
         assert set(fast.keys(True, True)) == set(slow.keys(True, True))
         for key in ("loc", "scale", "observation"):
             torch.testing.assert_close(fast[key], slow[key])
+
+    @pytest.mark.parametrize("activation", ACTIVATIONS)
+    @pytest.mark.parametrize("deterministic", [False, True])
+    def test_a_dense_network_runs_without_its_modules_and_says_the_same(
+        self, activation: str, deterministic: bool
+    ) -> None:
+        actor = make_actor(3, 2, (8, 16), activation)
+        nn.init.normal_(actor.module[0].module.mean[-1].weight)
+        nn.init.normal_(actor.module[0].module.scale.state_independent_scale)
+        step = policy_step(actor, "action", ["observation_norm"])
+        for number in (4, 1):
+            observations = torch.randn(3, number, 3)
+            generator = torch.Generator().manual_seed(0)
+            with step.session(generator, deterministic), calls(actor.module[0].module) as called:
+                found = [{k: v.clone() for k, v in step({"observation_norm": each}).items()} for each in observations]
+            assert not called
+            draws = torch.randn((256, number, 2), generator=torch.Generator().manual_seed(0))
+            for observation, values, draw in zip(observations, found, draws, strict=False):
+                loc, scale = actor.module[0].module(observation)
+                torch.testing.assert_close(values["loc"], loc.detach())
+                torch.testing.assert_close(values["scale"], scale.detach())
+                expected = loc if deterministic else loc + scale * draw
+                torch.testing.assert_close(values["action"], expected.detach())
+
+    @pytest.mark.parametrize(
+        "layers",
+        [
+            [nn.Linear(3, 4), nn.LayerNorm(4), nn.Linear(4, 2)],
+            [nn.Linear(3, 4), nn.Tanh(), nn.Tanh(), nn.Linear(4, 2)],
+            [nn.Tanh(), nn.Linear(3, 2)],
+            [nn.utils.parametrizations.weight_norm(nn.Linear(3, 2))],
+            [nn.utils.spectral_norm(nn.Linear(3, 2))],  # a hook
+            [nn.Linear(3, 300), nn.Linear(300, 200), nn.Linear(200, 2)],  # too large
+            [nn.Sequential(nn.Linear(3, 4, bias=False), nn.ReLU()), nn.Linear(4, 2)],
+            [MLP(3, 2, num_cells=[4])],
+        ],
+    )
+    def test_any_other_network_says_the_same(self, layers: list[nn.Module]) -> None:
+        net = nn.Sequential(*layers, AddStateIndependentNormalScale(2)).eval()
+        actor = ProbabilisticActor(
+            TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=IndependentNormal,
+        )
+        step = policy_step(actor, "action", ["observation"])
+        observation = torch.randn(5, 3)
+        with step.session(torch.Generator(), True), calls(net) as called:
+            found = step({"observation": observation})
+        known = type(layers[0]) in (nn.Sequential, MLP)
+        assert bool(called) is not known
+        torch.testing.assert_close(found["action"], net(observation)[0].detach())
+
+    def test_a_hook_inside_the_network_counts_from_the_next_rollout_on(self) -> None:
+        actor = gaussian(3, 2)
+        collecting = collector(actor)
+        collecting.rollout()
+        actor.module[0].module[0].register_forward_hook(lambda *_: torch.full((3, 16), torch.inf))
+        actor.module[0].module[2].register_forward_hook(lambda *_: torch.full((3, 2), 100.0))
+        assert (collecting.rollout()["action"] > 50).all()
 
     def test_new_parameters_count_from_the_next_step_on(self) -> None:
         actor = gaussian(3, 2)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import (
+    AddStateIndependentNormalScale,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -17,11 +21,14 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import IndependentNormal, SafeModule, SafeProbabilisticModule
+from torchrl.modules import MLP, IndependentNormal, SafeModule, SafeProbabilisticModule
+
+from torchrl_priors.networks import ACTIVATIONS, GaussianMLP
 
 __all__ = ["GaussianStep", "ModuleStep", "PolicyStep", "policy_step"]
 
 _CHUNK = 256  # steps whose noise is drawn at once
+_ONE_THREAD = 2**18  # multiplications of a matrix product up to which OpenBLAS keeps to one thread
 
 
 class PolicyStep(ABC):
@@ -43,7 +50,10 @@ class PolicyStep(ABC):
 
     @abstractmethod
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-        """What the policy writes for the observations of one step, by key, each ``[N, ...]``."""
+        """What the policy writes for the observations of one step, by key, each ``[N, ...]``.
+
+        The next call of a session may write the same tensors again; then it returns the same dict.
+        """
 
     @abstractmethod
     def complete(self, batch: TensorDictBase) -> None:
@@ -83,7 +93,8 @@ class GaussianStep(PolicyStep):
     """A diagonal Gaussian policy made of plain modules: they are called directly, on tensors.
 
     The noise is drawn for many steps at once, and the log-probabilities are computed for a whole batch: both give what
-    the policy itself would give, with other random numbers.
+    the policy itself would give, with other random numbers. Of a small dense network on the CPU, with the same standard
+    deviation in every state, not even the modules are called: NumPy computes what they would.
     """
 
     def __init__(
@@ -98,18 +109,33 @@ class GaussianStep(PolicyStep):
         self._head = head
         self._loc, self._scale = (key for key in head.in_keys)
         self._generator: torch.Generator | None = None
-        self._noise: Iterator[Tensor] = iter(())
+        self._noise: Iterator[Any] = iter(())
         self._deterministic = False
+        self._dense: _DenseGaussian | None = None
+        self._outputs: dict[NestedKey, Tensor] = {}  # of a dense network: the same in all steps of a session
 
     @contextmanager
     def session(self, generator: torch.Generator, deterministic: bool) -> Iterator[None]:
         """See :class:`PolicyStep`."""
         self._generator, self._noise, self._deterministic = generator, iter(()), deterministic
+        self._dense = self._find_dense() if generator.device.type == "cpu" else None  # hooks may come and go
+        self._outputs = {}
         with torch.no_grad():
             yield
 
+    def _find_dense(self) -> _DenseGaussian | None:
+        (module, in_keys, out_keys), *more = self._body
+        if more or len(in_keys) != 1 or out_keys != (self._loc, self._scale):
+            return None
+        return _DenseGaussian.of(module)
+
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
         """See :class:`PolicyStep`."""
+        if self._dense is not None:
+            observation = inputs[self.policy.in_keys[0]]
+            if self._outputs or self._dense.prepare(observation):
+                return self._call_dense(self._dense, observation)
+            self._dense = None
         values = dict(inputs)
         for module, in_keys, out_keys in self._body:
             out = module(*[values[key] for key in in_keys])
@@ -117,18 +143,35 @@ class GaussianStep(PolicyStep):
                 out = (out,)
             values.update(zip(out_keys, out, strict=True))
         loc, scale = values[self._loc], values[self._scale]
-        values[self.action_key] = loc if self._deterministic else loc + self._next_noise(loc) * scale
+        if self._deterministic:
+            values[self.action_key] = loc
+        else:
+            noise = next(self._noise, None)
+            if noise is None:
+                self._noise = iter(self._draw(loc).unbind(0))
+                noise = next(self._noise)
+            values[self.action_key] = loc + noise * scale
         for key in inputs:
             del values[key]
         return values
 
-    def _next_noise(self, like: Tensor) -> Tensor:
-        noise = next(self._noise, None)
-        if noise is None:
-            draws = torch.randn((_CHUNK, *like.shape), generator=self._generator, dtype=like.dtype, device=like.device)
-            self._noise = iter(draws.unbind(0))
-            noise = next(self._noise)
-        return noise
+    def _call_dense(self, dense: _DenseGaussian, observation: Tensor) -> dict[NestedKey, Tensor]:
+        dense(observation)
+        if not self._outputs:
+            action = dense.loc if self._deterministic else torch.empty_like(dense.loc)
+            self._outputs = {self._loc: dense.loc, self._scale: dense.scale, self.action_key: action}
+            self._action, self._mean = action.numpy(), dense.loc.numpy()
+        if not self._deterministic:
+            noise = next(self._noise, None)
+            if noise is None:
+                self._noise = iter((self._draw(dense.loc) * dense.scale).numpy())
+                noise = next(self._noise)
+            np.add(self._mean, noise, out=self._action)
+        return self._outputs
+
+    def _draw(self, like: Tensor) -> Tensor:
+        """The noise of the next steps."""
+        return torch.randn((_CHUNK, *like.shape), generator=self._generator, dtype=like.dtype, device=like.device)
 
     def complete(self, batch: TensorDictBase) -> None:
         """Adds the log-probability, if the policy returns it."""
@@ -136,6 +179,105 @@ class GaussianStep(PolicyStep):
             with torch.no_grad():
                 distribution = self._head.get_dist(batch)
                 batch.set(self._head.log_prob_key, distribution.log_prob(batch.get(self.action_key)))
+
+
+class _DenseGaussian:
+    """A small dense network with a state-independent scale, computed by NumPy on memory that stays.
+
+    The parameters are used where they are. NumPy's calls take a third of the time of PyTorch's, on such small matrices;
+    larger ones, which its matrix product would spread over threads, are refused by :meth:`prepare`.
+
+    Args:
+        layers (list): linear layers, each with the activation that follows it, if one does.
+        scale (AddStateIndependentNormalScale): the last layer.
+    """
+
+    loc: Tensor
+    scale: Tensor
+
+    def __init__(
+        self, layers: list[tuple[nn.Linear, nn.Module | None]], scale_layer: AddStateIndependentNormalScale
+    ) -> None:
+        self._layers = layers
+        self._scale_layer = scale_layer
+        self._steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, Callable[..., object] | None]] = []
+        self._source: Tensor | None = None
+        self._input = np.empty(0)
+
+    @classmethod
+    def of(cls, module: nn.Module) -> _DenseGaussian | None:
+        """That of a module; None if there is more to it."""
+        found = _layers(module)
+        if not found or not isinstance(scale_layer := found.pop(), AddStateIndependentNormalScale):
+            return None
+        layers: list[tuple[nn.Linear, nn.Module | None]] = []
+        for layer in found:
+            if isinstance(layer, nn.Linear):
+                layers.append((layer, None))
+            elif type(layer) in ACTIVATIONS.values() and layers and layers[-1][1] is None:
+                layers[-1] = (layers[-1][0], layer)
+            else:
+                return None
+        plain = all(layer.weight.dtype == torch.float32 and layer.weight.device.type == "cpu" for layer, _ in layers)
+        return cls(layers, scale_layer) if layers and plain else None
+
+    def prepare(self, observation: Tensor) -> bool:
+        """Takes memory for observations ``[N, features]`` such as this one; False if they are others, or too many."""
+        if observation.ndim != 2 or observation.dtype != torch.float32:
+            return False
+        rows = len(observation)
+        if any(rows * layer.in_features * layer.out_features > _ONE_THREAD for layer, _ in self._layers):
+            return False
+        for layer, activation in self._layers:
+            self.loc = torch.empty(rows, layer.out_features)
+            bias = torch.zeros(layer.out_features) if layer.bias is None else layer.bias.detach()
+            function = None if activation is None else _in_place(activation, self.loc)
+            self._steps.append((layer.weight.detach().t().numpy(), bias.numpy(), self.loc.numpy(), function))
+        self.scale = self._scale_layer(self.loc)[1].contiguous()
+        return True
+
+    def __call__(self, observation: Tensor) -> None:
+        """Writes the mean at observations ``[N, features]`` into ``loc``."""
+        if observation is not self._source:
+            self._source, self._input = observation, observation.numpy()
+        x = self._input
+        for weight, bias, out, function in self._steps:
+            np.matmul(x, weight, out=out)
+            np.add(out, bias, out=out)
+            if function is not None:
+                function(out, out=out)
+            x = out
+
+
+def _in_place(activation: nn.Module, tensor: Tensor) -> Callable[..., object]:
+    """What applies an activation to the memory of a tensor, called as a ufunc on its array."""
+    if type(activation) is nn.Tanh:
+        return np.tanh
+    if type(activation) is nn.ReLU:
+        return partial(np.maximum, np.float32(0))
+    return lambda array, out: tensor.copy_(activation.forward(tensor))
+
+
+def _layers(module: nn.Module) -> list[nn.Module] | None:
+    """The layers of a dense network, one after the other; None if a module may do more than its class says."""
+    if _has_hooks(module) or "forward" in vars(module):
+        return None
+    if type(module) is GaussianMLP:
+        children: list[nn.Module] = [module.mean, module.scale]
+    elif isinstance(module, nn.Sequential) and type(module) in (nn.Sequential, MLP):
+        if getattr(module, "_reshape_out", False):
+            return None
+        children = list(module)
+    else:
+        plain = (nn.Linear, AddStateIndependentNormalScale, *ACTIVATIONS.values())
+        return [module] if type(module) in plain else None
+    layers: list[nn.Module] = []
+    for child in children:
+        found = _layers(child)
+        if found is None:
+            return None
+        layers += found
+    return layers
 
 
 def policy_step(policy: TensorDictModuleBase, action_key: NestedKey, input_keys: Sequence[NestedKey]) -> PolicyStep:

@@ -175,6 +175,9 @@ class VectorCollector:
             inputs[self.normalized_key] = torch.from_numpy(policy_input)
         on_cpu = self.device.type == "cpu"
         written: dict[NestedKey, Tensor] = {}
+        outputs: dict[NestedKey, Tensor] = {}
+        arrays: dict[NestedKey, np.ndarray] = {}  # the memory of `written`
+        drawn: dict[NestedKey, np.ndarray] = {}  # that of `outputs`
 
         with self._step.session(self._generator, deterministic=False):
             for t in range(steps):
@@ -186,14 +189,22 @@ class VectorCollector:
                     np.minimum(policy_input, clip, out=policy_input)
                     np.maximum(policy_input, -clip, out=policy_input)
 
+                last = outputs
                 outputs = self._step(inputs if on_cpu else {key: x.to(self.device) for key, x in inputs.items()})
                 if not written:
                     written = {key: value.new_empty((*shape, *value.shape[1:])) for key, value in outputs.items()}
-                for key, value in outputs.items():
-                    written[key][:, t] = value
-                action = outputs[self.action_key]
-                sent[...] = (action if on_cpu else action.cpu()).numpy()
-                np.minimum(sent, self._high, out=sent)
+                    arrays = _arrays(written)
+                if arrays:
+                    if outputs is not last:
+                        drawn = _arrays(outputs)
+                    for key, array in arrays.items():
+                        array[:, t] = drawn[key]
+                    action = drawn[self.action_key]
+                else:  # the same, slower
+                    for key, value in outputs.items():
+                        written[key][:, t] = value
+                    action = outputs[self.action_key].cpu().numpy()
+                np.minimum(action, self._high, out=sent)
                 np.maximum(sent, self._low, out=sent)
 
                 next_obs, reward, terminated, truncated, _ = env.step(sent)
@@ -208,7 +219,7 @@ class VectorCollector:
                 step_counts[:, t] = self._step_count
                 obs[...] = next_obs
                 done = terminated | truncated
-                if done.any():
+                if True in done.tolist():  # a fraction of what `any` takes
                     self._begin_episodes(done)
 
         return self._batch(
@@ -314,3 +325,11 @@ class VectorCollector:
     def shutdown(self) -> None:
         """Closes the environments."""
         self.env.close()
+
+
+def _arrays(tensors: Mapping[NestedKey, Tensor]) -> dict[NestedKey, np.ndarray]:
+    """The same memory as arrays; nothing where NumPy can't have it."""
+    try:
+        return {key: tensor.detach().numpy() for key, tensor in tensors.items()}
+    except TypeError:  # another device, or bfloat16
+        return {}
