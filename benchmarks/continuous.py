@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-sys.path[:] = [str(ROOT), *(entry for entry in sys.path if entry != str(ROOT / "benchmarks"))]  # this is not mujoco
+sys.path.insert(0, str(ROOT))  # also where it is not installed
 
 import torch
 from hydra import compose, initialize_config_dir
