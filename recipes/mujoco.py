@@ -247,6 +247,8 @@ def train(cfg: MujocoConfig, run: Run) -> None:
     run.register(agent=agent, optimizer=optimise.adam, collector=collector)
     for scheduler in schedulers.values():
         scheduler.step(collector.frames)
+    if cfg.compile:
+        run.announce("compiling")
     start, first = time.perf_counter(), collector.frames
     for rollout in collector:
         metrics = optimise(agent.prepare(rollout))

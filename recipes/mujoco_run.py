@@ -94,6 +94,10 @@ class Run:
             identity = f"{path.name}-{digest(matters | {'out': str(path.resolve())})}"
             self.logger = RunLogger(self.cfg.logger, path, matters, self.frames, identity)
 
+    def announce(self, text: str) -> None:
+        """Say in the progress bar what takes its time, until the next rollout is logged."""
+        self.bar.set_description(text)
+
     def log(self, frames: int, metrics: dict[str, Tensor], weights: Tensor | None = None) -> None:
         """Keep one rollout's metrics; the prior weights of its states go to the logger only.
 
@@ -108,6 +112,8 @@ class Run:
                 f"{', '.join(bad)} became NaN or infinite at {frames} frames; the last checkpoint before it is {last}."
             )
         self.metrics.append(row)
+        if self.bar.desc:
+            self.bar.set_description(None)
         self.bar.update(frames - self.frames)
         self.frames = frames
         if self.logger is not None:

@@ -1,7 +1,7 @@
 """Speed of PPO on MuJoCo: the recipe, with and without a prior, against Stable-Baselines3 and TorchRL's collector.
 
     pip install torchrl-priors[benchmarks]
-    python benchmarks/mujoco.py [--env halfcheetah] [--rounds 8] [--rollouts 4] [recipe key=value ...]
+    python benchmarks/continuous.py [--env halfcheetah] [--rounds 8] [--rollouts 4] [recipe key=value ...]
 
 One process and one thread. The contenders take turns, a few rollouts each, so that whatever else the machine does hits
 them alike; a ratio is the median over rounds of a ratio within a round. The teacher is an untrained network: its speed
@@ -23,7 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
-sys.path[:] = [str(ROOT), *(entry for entry in sys.path if entry != str(ROOT / "benchmarks"))]  # this is not mujoco
+sys.path.insert(0, str(ROOT))  # also where it is not installed
 
 import torch
 from hydra import compose, initialize_config_dir
