@@ -112,8 +112,7 @@ class Run:
                 f"{', '.join(bad)} became NaN or infinite at {frames} frames; the last checkpoint before it is {last}."
             )
         self.metrics.append(row)
-        if self.bar.desc:
-            self.bar.set_description(None)
+        self.bar.set_description(None, refresh=False)
         self.bar.update(frames - self.frames)
         self.frames = frames
         if self.logger is not None:
