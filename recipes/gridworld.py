@@ -76,13 +76,14 @@ class TaughtWorld:
         self.cfg, self.seed = cfg, seed
         self.grid = sample_world(cfg, seed)
         self.world = tabular_runs.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
-        states, teacher = len(self.world.state), cfg.teacher
-        self.q, self.visited = np.zeros((states, 4)), np.zeros(states, bool)
-        rng = tabular_runs.generator(seed, "teacher")
-        tabular.teach(
-            self.world, self.q, self.visited, teacher.steps, float(teacher.gamma), float(teacher.lr),
-            float(teacher.epsilon), rng,
-        )  # fmt: skip
+        self.q, self.visited = self.teach()
+
+    def teach(self) -> tuple[np.ndarray, np.ndarray]:
+        """Action values of the teacher, ``[C, 4]``, and which states it visited, ``[C]``."""
+        states, cfg = len(self.world.state), self.cfg.teacher
+        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), tabular_runs.generator(self.seed, "teacher")
+        tabular.teach(self.world, q, visited, cfg.steps, float(cfg.gamma), float(cfg.lr), float(cfg.epsilon), rng)
+        return q, visited
 
     def facts(self) -> dict[str, Any]:
         """What ``worlds.csv`` says about the world and its teacher."""

@@ -25,3 +25,12 @@ def test_the_continuous_benchmark_runs() -> None:
     assert done.returncode == 0, done.stderr[-2000:]
     for line in ("first rollout of ae2r", "train    stable-baselines3", "ae2r / none, training", "TorchRL's Collector"):
         assert line in done.stdout, done.stdout
+
+
+def test_the_gridworld_benchmark_runs() -> None:
+    assert "`python benchmarks/gridworld.py`" in (ROOT / "README.md").read_text()
+    command = [sys.executable, "benchmarks/gridworld.py", "--worlds", "1", "--rounds", "1"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    for line in ("worlds per CPU second", "ae2r", "the paper's table", "GiB"):
+        assert line in done.stdout, done.stdout

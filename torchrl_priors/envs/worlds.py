@@ -112,13 +112,13 @@ def windows(kind: Tensor, window: int) -> Tensor:
 
 
 def _first_alike(views: Tensor) -> Tensor:
-    """For each cell, the first cell of its world with the same view: ``[W, C, ...]`` to int64 ``[W, C]``."""
+    """For each cell, the first cell of its world with the same view: uint8 ``[W, C, ...]`` to int64 ``[W, C]``."""
+    rows = np.ascontiguousarray(views.flatten(2).cpu().numpy())
     first = []
-    for view in views.flatten(2):
-        _, group = torch.unique(view, dim=0, return_inverse=True)
-        cells = torch.arange(len(group), device=group.device)
-        first.append(torch.full_like(group, len(group)).scatter_reduce_(0, group, cells, "amin")[group])
-    return torch.stack(first)
+    for view in rows.view(f"V{rows.shape[-1]}")[..., 0]:  # each row as one value
+        _, index, group = np.unique(view, return_index=True, return_inverse=True)
+        first.append(index[group])
+    return torch.from_numpy(np.stack(first)).to(views.device)
 
 
 def sample_worlds(
