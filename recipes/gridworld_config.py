@@ -136,7 +136,7 @@ def check(cfg: GridworldConfig) -> None:
         "workers": 1 if cfg.workers is None else cfg.workers,
     }
     for key, value in positive.items():
-        _require(0 < value < float("inf"), key, value, "a positive number")
+        _require(0 < value < 2**31, key, value, "a positive number below 2**31")
     _require(cfg.world.window > 0 and cfg.world.window % 2 == 1, "world.window", cfg.world.window, "an odd number")
     probabilities = {f"world.{name}": cfg.world[name] for name in ("wall_prob", "object_prob", "noise")}  # type: ignore[index]
     probabilities |= {"teacher.epsilon": cfg.teacher.epsilon, "teacher.gamma": cfg.teacher.gamma}

@@ -130,7 +130,12 @@ def make_advice(prior: PriorSpec, q: np.ndarray, visited: np.ndarray, temperatur
     Degraded states are drawn from softmax(max_a Q / temperature) over the visited ones until enough are distinct. That
     is drawing without replacement, which adding Gumbel noise and taking the highest does in one go. A world with fewer
     visited states gets them all.
+
+    Raises:
+        ValueError: the teacher's values are not finite.
     """
+    if not np.isfinite(q).all():
+        raise ValueError(f"The teacher of world {seed} has learned values that are not finite: lower teacher.lr.")
     logits = np.stack([q, -q]) / temperature
     logits -= logits.max(-1, keepdims=True)
     degraded = np.zeros(len(visited), bool)

@@ -48,7 +48,10 @@ def generator() -> torch.Generator:
 
 @pytest.fixture
 def without_torchrls_groups(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once ``register_configs`` has run in a process, what recipes call model= and logger= are groups of TorchRL's."""
+    """Once ``register_configs`` has run in a process, Hydra knows TorchRL's hundreds of configs beside the recipes'.
+
+    What recipes call model= and logger= would be groups, and ``--help`` would take half a minute to list them all.
+    """
     store = pytest.importorskip("hydra.core.config_store").ConfigStore.instance()
-    repo = {name: node for name, node in store.repo.items() if name not in ("model", "logger")}
+    repo = {name: node for name, node in store.repo.items() if name in ("hydra", "schema") or name.endswith(".yaml")}
     monkeypatch.setattr(store, "repo", repo)

@@ -57,6 +57,14 @@ def test_degraded_states_depend_on_the_seed_and_on_their_number():
     assert len({mask.tobytes() for mask in sampled(2, 9.0, seeds=20)}) > 1
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_broken_action_values_are_refused_by_the_seed_of_their_world(value):
+    q = Q.copy()
+    q[2, 0] = value
+    with pytest.raises(ValueError, match=r"world 7 .*teacher\.lr"):
+        make_advice(parse_prior("expert"), q, VISITED, 1.0, 7)
+
+
 def test_advice_is_that_of_the_boltzmann_prior_and_its_adversary():
     prior = BoltzmannPrior(torch.from_numpy(Q), 0.5)
     states = TensorDict(state=torch.arange(5), batch_size=[5])
