@@ -55,7 +55,7 @@ class RunLogger:
         if name == "tensorboard" and continued:
             writer = self._logger.experiment
             writer.close()
-            writer.purge_step = frames + 1  # the next file begins with it
+            writer.purge_step = frames + 1 if frames else 0  # the next file begins with it
 
     def scalars(self, prefix: str, row: Mapping[str, float]) -> None:
         """Log a row of a table; what is not finite has no point."""

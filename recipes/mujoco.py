@@ -247,6 +247,19 @@ def train(cfg: MujocoConfig, run: Run) -> None:
     run.register(agent=agent, optimizer=optimise.adam, collector=collector)
     for scheduler in schedulers.values():
         scheduler.step(collector.frames)
+
+    def evaluate_policy() -> None:
+        result = evaluate(
+            test_env,
+            agent.actor,
+            episodes=cfg.evaluation.episodes,
+            normalizer=agent.normalizer,
+            seed=cfg.seed * 1_000_003 + collector.frames,
+        )
+        run.log_evaluation(collector.frames, result)
+
+    if collector.frames == 0:
+        evaluate_policy()
     if cfg.compile:
         run.announce("compiling")
     start, first = time.perf_counter(), collector.frames
@@ -267,14 +280,7 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         for scheduler in schedulers.values():
             scheduler.step(collector.frames)
         if run.evaluation_is_due(collector.frames):
-            result = evaluate(
-                test_env,
-                agent.actor,
-                episodes=cfg.evaluation.episodes,
-                normalizer=agent.normalizer,
-                seed=cfg.seed * 1_000_003 + collector.frames,
-            )
-            run.log_evaluation(collector.frames, result)
+            evaluate_policy()
         run.checkpoint_if_due(collector.frames)
     run.finish(agent.actor, agent.normalizer, env_id)
 

@@ -36,7 +36,7 @@ def teacher(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("method", [method for method in METHODS if method != "none"])
 def test_every_method_trains_from_a_teacher_that_the_recipe_made(method, td_error, teacher, tmp_path):
     out = run(tmp_path, f"method={method}", f"prior.path={teacher}", f"td_error={td_error}", "total_frames=128")
-    assert len(pd.read_csv(out / "eval.csv")) == 2
+    assert len(pd.read_csv(out / "eval.csv")) == 3  # before the first frame, too
     metrics = pd.read_csv(out / "metrics.csv")
     assert ("loss_prior" in metrics) == METHODS[method].auxiliary
     assert ("loss_prior_weight" in metrics) == METHODS[method].adaptive
@@ -270,7 +270,7 @@ def test_nan_losses_stop_the_run_and_keep_the_last_checkpoint(tmp_path, monkeypa
     assert "128" in str(error.value).rsplit("checkpoint", 1)[1]
     assert '"failed"' in (tmp_path / "status.json").read_text()
     run(tmp_path)  # the cause gone, it goes on from there
-    assert pd.read_csv(tmp_path / "eval.csv")["frames"].tolist() == [64, 128, 192, 256]
+    assert pd.read_csv(tmp_path / "eval.csv")["frames"].tolist() == [0, 64, 128, 192, 256]
 
 
 def test_a_sweep_runs_every_combination_although_one_is_broken(tmp_path):
