@@ -60,6 +60,7 @@ def make_learner(cfg: GridworldConfig, method: str) -> tabular_runs.Learner:
         td_error=cfg.td_error,
         bonus_coeff=cfg.student.bonus_coeff,
         aux_coeff=cfg.student.aux_coeff,
+        cross_entropy=cfg.student.cross_entropy,
         schedule=schedule,
     )
 

@@ -56,7 +56,8 @@ class Student:
     gamma: float = MISSING
     lr: float = MISSING
     bonus_coeff: float = MISSING
-    aux_coeff: float = MISSING
+    aux_coeff: float | None = MISSING
+    cross_entropy: str | None = MISSING
     lr_weight: LrWeight = field(default_factory=LrWeight)
 
 
@@ -121,6 +122,8 @@ def check(cfg: GridworldConfig) -> None:
             except ValueError as error:
                 raise ValueError(f"{key}={list(names)}: {error}") from None
     _require("none" in cfg.methods, "methods", list(cfg.methods), "none among them: area ratios compare with it")
+    whose = cfg.student.cross_entropy
+    _require(whose in (None, "student", "teacher"), "student.cross_entropy", whose, "student, teacher or null")
     _require(cfg.td_error in ("original", "shaped"), "td_error", cfg.td_error, "original or shaped")
     check_schedule(cfg.schedule)
     positive = {
@@ -151,7 +154,7 @@ def check(cfg: GridworldConfig) -> None:
     )
     rates = {"teacher.lr": cfg.teacher.lr, "student.lr": cfg.student.lr}
     rates |= {f"student.lr_weight.{name}": cfg.student.lr_weight[name] for name in ("original", "shaped", "advantage")}  # type: ignore[index]
-    rates |= {"student.bonus_coeff": cfg.student.bonus_coeff, "student.aux_coeff": cfg.student.aux_coeff}
+    rates |= {"student.bonus_coeff": cfg.student.bonus_coeff, "student.aux_coeff": cfg.student.aux_coeff or 0.0}
     for key, value in rates.items():
         _require(0 <= value < float("inf"), key, value, "a number of at least 0")
     _require(0 <= cfg.seed < 2**62, "seed", cfg.seed, "a number in [0, 2**62)")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,14 @@ from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
-from torchrl_priors.methods import get_method
+from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.networks import make_actor
 from torchrl_priors.objectives import cross_entropy
 
-__all__ = ["MujocoConfig", "check"]
+__all__ = ["ALONE", "MujocoConfig", "check", "method_of", "teachers"]
+
+ALONE = "alone"
+"""The student of a trial that has no teacher."""
 
 
 @dataclass
@@ -44,7 +48,7 @@ class Env:
 class Prior:
     """The teacher."""
 
-    path: str | None = MISSING
+    path: Any = MISSING
     degrade: str = MISSING
     feature: int = MISSING
     threshold: float = MISSING
@@ -59,8 +63,26 @@ class Weight:
     init_bias: float = MISSING
     trained: str = MISSING
     epochs: int = MISSING
-    listen: int = MISSING
-    min_trust: float = MISSING
+
+
+@dataclass
+class Trial:
+    """How it is found out whether a teacher helps."""
+
+    method: str = MISSING
+    max_frames: int = MISSING
+    min_frames: int = MISSING
+    alpha: float = MISSING
+    recent: float = MISSING
+
+
+@dataclass
+class LetGo:
+    """When a teacher that helped is let go."""
+
+    methods: str = MISSING
+    window: int = MISSING
+    rate: float = MISSING
 
 
 @dataclass
@@ -104,10 +126,13 @@ class MujocoConfig:
     total_frames: int = MISSING
     prior: Prior = field(default_factory=Prior)
     weight: Weight = field(default_factory=Weight)
+    trial: Trial = field(default_factory=Trial)
+    let_go: LetGo = field(default_factory=LetGo)
+    cross_entropy: str | None = MISSING
     td_error: str = MISSING
     centering: str = MISSING
     bonus_coeff: float = MISSING
-    aux_coeff: float = MISSING
+    aux_coeff: float | None = MISSING
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     ppo: PPO = field(default_factory=PPO)
     evaluation: Evaluation = field(default_factory=Evaluation)
@@ -119,6 +144,22 @@ class MujocoConfig:
 
 
 ConfigStore.instance().store(group="schema", name="mujoco", node=MujocoConfig, package="_global_")
+
+
+def teachers(cfg: MujocoConfig) -> list[Path]:
+    """The teachers' files."""
+    path = cfg.prior.path
+    return [] if path is None else [Path(path)] if isinstance(path, str) else [Path(str(one)) for one in path]
+
+
+def method_of(cfg: MujocoConfig) -> MethodSpec:
+    """What is done with the teacher: the settings of the method, or of that which a trial tries.
+
+    Raises:
+        ValueError: there is no such method.
+    """
+    spec = get_method(cfg.trial.method if cfg.method == "trial" else cfg.method)
+    return spec if cfg.cross_entropy is None else replace(spec, cross_entropy=cfg.cross_entropy)  # type: ignore[arg-type]
 
 
 def _require(holds: bool, key: str, value: Any, expected: str) -> None:
@@ -134,25 +175,26 @@ def check(cfg: MujocoConfig) -> None:
         ImportError: names the extra that is needed.
     """
     check_keys(cfg)
-    get_method(cfg.method)
-    if cfg.method != "none":
-        _require(
-            cfg.prior.path is not None,
-            "prior.path",
-            cfg.prior.path,
-            f"the file of a teacher, as method={cfg.method} has one",
-        )
+    spec = method_of(cfg)
+    files = teachers(cfg)
+    if cfg.method == "trial":
+        _check_trial(cfg, files)
+    elif cfg.method != "none":
+        expected = "the file of a teacher" if not files else "one teacher; method=trial takes several"
+        _require(len(files) == 1, "prior.path", cfg.prior.path, f"{expected}, as method={cfg.method} has one")
     options = {
         "td_error": (cfg.td_error, ("original", "shaped")),
         "centering": (cfg.centering, ("none", "prior", "policy")),
         "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
-        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "trust", "oracle")),
+        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "oracle")),
+        "let_go.methods": (cfg.let_go.methods, ("trial", "all", "none")),
+        "cross_entropy": (cfg.cross_entropy, (None, "student", "teacher")),
         "logger": (cfg.logger, LOGGERS),
     }
     for key, (choice, allowed) in options.items():
-        _require(choice in allowed, key, choice, f"one of {', '.join(allowed)}")
+        _require(choice in allowed, key, choice, f"one of {', '.join(map(str, allowed))}")
     check_schedule(cfg.schedule)
-    if get_method(cfg.method).relative:
+    if spec.relative:
         _require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
     positive = {
         "total_frames": cfg.total_frames,
@@ -165,7 +207,8 @@ def check(cfg: MujocoConfig) -> None:
         "ppo.adam_eps": cfg.ppo.adam_eps,
         "ppo.max_grad_norm": cfg.ppo.max_grad_norm,
         "weight.epochs": cfg.weight.epochs,
-        "weight.listen": cfg.weight.listen,
+        "let_go.window": cfg.let_go.window,
+        "let_go.rate": cfg.let_go.rate,
         "evaluation.interval": cfg.evaluation.interval,
         "evaluation.episodes": cfg.evaluation.episodes,
         "checkpoint.interval": cfg.checkpoint.interval,
@@ -176,7 +219,7 @@ def check(cfg: MujocoConfig) -> None:
     at_least_0 = {
         "seed": cfg.seed,
         "bonus_coeff": cfg.bonus_coeff,
-        "aux_coeff": cfg.aux_coeff,
+        "aux_coeff": 0.0 if cfg.aux_coeff is None else cfg.aux_coeff,
         "weight.lr_coeff": cfg.weight.lr_coeff,
         "ppo.entropy_coeff": cfg.ppo.entropy_coeff,
     }
@@ -187,7 +230,6 @@ def check(cfg: MujocoConfig) -> None:
     for key, value in finite.items():
         _require(math.isfinite(value), key, value, "a finite number")
     shares = {"ppo.gamma": cfg.ppo.gamma, "ppo.gae_lambda": cfg.ppo.gae_lambda, "prior.prob": cfg.prior.prob}
-    shares["weight.min_trust"] = cfg.weight.min_trust
     for key, value in shares.items():
         _require(0 <= value <= 1, key, value, "a number in [0, 1]")
     _require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
@@ -206,8 +248,8 @@ def check(cfg: MujocoConfig) -> None:
     require_logger(cfg.logger)
     require_compiler(cfg.compile)
     obs_dim, act_dim = _check_env(cfg)
-    if cfg.method != "none":
-        _check_prior(cfg, obs_dim, act_dim)
+    for file in files if cfg.method != "none" else ():
+        _check_prior(cfg, file, obs_dim, act_dim)
 
 
 def _check_env(cfg: MujocoConfig) -> tuple[int, int]:
@@ -231,9 +273,30 @@ def _check_env(cfg: MujocoConfig) -> tuple[int, int]:
         raise ValueError(f"env={name}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
 
-def _check_prior(cfg: MujocoConfig, obs_dim: int, act_dim: int) -> None:
-    """Read the teacher, so that a wrong one is refused before there is a folder of the run."""
-    path = Path(str(cfg.prior.path))
+def _check_trial(cfg: MujocoConfig, files: Sequence[Path]) -> None:
+    trial, arms = cfg.trial, len(files) + 1
+    _require(bool(files), "prior.path", cfg.prior.path, "the files of one or more teachers, as method=trial tries them")
+    names = [file.stem for file in files]
+    _require(len({*names, ALONE}) == arms, "prior.path", cfg.prior.path, f"files of different names, none {ALONE!r}")
+    _require(trial.method != "none", "trial.method", trial.method, "a method with a teacher")
+    batch = cfg.env.frames_per_batch
+    _require(trial.max_frames >= batch, "trial.max_frames", trial.max_frames, f"at least one rollout of {batch}")
+    _require(
+        0 <= trial.min_frames <= trial.max_frames,
+        "trial.min_frames",
+        trial.min_frames,
+        f"a number from 0 to trial.max_frames={trial.max_frames}",
+    )
+    _require(0 < trial.alpha < 1, "trial.alpha", trial.alpha, "a number between 0 and 1")
+    _require(0 < trial.recent <= 1, "trial.recent", trial.recent, "a share above 0 and up to 1")
+    least = arms * (-(-trial.max_frames // batch)) * batch
+    _require(
+        cfg.total_frames >= least, "total_frames", cfg.total_frames, f"at least {least}, for a trial of {arms} students"
+    )
+
+
+def _check_prior(cfg: MujocoConfig, path: Path, obs_dim: int, act_dim: int) -> None:
+    """Read a teacher, so that a wrong one is refused before there is a folder of the run."""
     if not path.is_file():
         raise FileNotFoundError(
             f"prior.path={path}: {'a folder, expected a file' if path.is_dir() else 'no such file'}."

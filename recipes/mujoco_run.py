@@ -10,22 +10,26 @@ import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 import torch
 from omegaconf import OmegaConf
 from torch import Tensor
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
 from recipes.launchers import fail, in_sweep
 from recipes.loggers import RunLogger
-from recipes.mujoco_config import MujocoConfig
+from recipes.mujoco_config import MujocoConfig, teachers
 from recipes.runs import RunFolder, digest, read_json, refuse_foreign
 from recipes.schedule_config import without_idle
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors.evaluation import Evaluation
+from torchrl_priors.teacher_trial import TrialResult
+
+if TYPE_CHECKING:
+    from recipes.mujoco_trial import Students
 
 __all__ = ["Run", "TrainingError", "supervise"]
 
@@ -47,15 +51,19 @@ class Run:
     def __init__(self, cfg: MujocoConfig) -> None:
         plain: Any = OmegaConf.to_container(cfg, resolve=True)
         matters = {key: value for key, value in plain.items() if key not in _INCIDENTAL}
-        matters = without_idle(matters, cfg.schedule, [cfg.method])
-        if cfg.prior.path is not None:
-            matters["prior"] |= {"path": Path(cfg.prior.path).name, "sha256": _sha256(Path(cfg.prior.path))}
+        idle = [] if cfg.method == "trial" else ["trial"] if cfg.let_go.methods == "all" else ["trial", "let_go"]
+        matters = {key: value for key, value in matters.items() if key not in idle}
+        matters = without_idle(matters, cfg.schedule, [cfg.trial.method if cfg.method == "trial" else cfg.method])
+        if files := teachers(cfg):
+            names, digests = [file.name for file in files], [_sha256(file) for file in files]
+            one = isinstance(cfg.prior.path, str)
+            matters["prior"] |= {"path": names[0] if one else names, "sha256": digests[0] if one else digests}
         env = f"{cfg.env.id}-{cfg.env.version}"
         path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}")
         self.cfg = cfg
         self.folder = RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True))
-        self.evaluations: list[dict[str, float]] = []
-        self.metrics: list[dict[str, float]] = []
+        self.evaluations: list[dict[str, Any]] = []
+        self.metrics: list[dict[str, Any]] = []
         self.rotation = CheckpointRotation(path / "checkpoints", keep_last=cfg.checkpoint.keep)
 
     @property
@@ -69,17 +77,16 @@ class Run:
         text = json.dumps({"state": state, **more})
         self.folder.write("status.json", lambda path: path.write_text(text))
 
-    def register(self, **components: Any) -> None:
-        """What a checkpoint consists of; loads the last one if the run is to be resumed, removes them all if not."""
+    def register(self, students: Students) -> None:
+        """Who learns; loads their last checkpoint if the run is to be resumed, removes all checkpoints if not."""
         self.frames = 0
-        self.collector = components["collector"]
-        self.checkpoint = Checkpoint(**components, rng=GlobalRNGState())
+        self.checkpoint = Checkpoint(**students.parts())
         if not self.cfg.resume and self.rotation.directory.exists():
             shutil.rmtree(self.rotation.directory)
         if self.cfg.resume and (latest := self.rotation.latest()) is not None:
             refuse_foreign(latest)
             self.rotation.load_latest(self.checkpoint)
-            self.frames = self.collector.frames
+            self.frames = students.frames
             self.evaluations = _rows_until(self.folder.path / "eval.csv", self.frames)
             self.metrics = _rows_until(self.folder.path / "metrics.csv", self.frames)
         self.next_evaluation = _next_multiple(self.frames, self.cfg.evaluation.interval)
@@ -98,8 +105,10 @@ class Run:
         """Say in the progress bar what takes its time, until the next rollout is logged."""
         self.bar.set_description(text)
 
-    def log(self, frames: int, metrics: dict[str, Tensor], weights: Tensor | None = None) -> None:
-        """Keep one rollout's metrics; the prior weights of its states go to the logger only.
+    def log(
+        self, frames: int, metrics: dict[str, Tensor], weights: Tensor | None = None, arm: str | None = None
+    ) -> None:
+        """Keep one rollout's metrics, in a trial with whose they are; its states' prior weights go to the logger only.
 
         Raises:
             TrainingError: a loss is not finite.
@@ -111,14 +120,21 @@ class Run:
             raise TrainingError(
                 f"{', '.join(bad)} became NaN or infinite at {frames} frames; the last checkpoint before it is {last}."
             )
-        self.metrics.append(row)
+        self.metrics.append(row if arm is None else {"arm": arm} | row)
         self.bar.set_description(None, refresh=False)
         self.bar.update(frames - self.frames)
         self.frames = frames
         if self.logger is not None:
-            self.logger.scalars("train", row)
+            prefix = "train" if arm is None else f"train/{arm}"
+            self.logger.scalars(prefix, row)
             if weights is not None:
-                self.logger.histogram("train/prior_weights", weights, frames)
+                self.logger.histogram(f"{prefix}/prior_weights", weights, frames)
+
+    def log_trial(self, result: TrialResult) -> None:
+        """Keep who won the trial, and say so."""
+        text = json.dumps(result._asdict(), indent=1)
+        self.folder.write("trial.json", lambda path: path.write_text(text))
+        tqdm.write(f"{self.folder.path}: {result}")
 
     def evaluation_is_due(self, frames: int) -> bool:
         """Whether the policy is to be evaluated now: every ``evaluation.interval`` frames and at the end."""
@@ -207,7 +223,7 @@ def _next_multiple(frames: int, interval: int) -> int:
     return (frames // interval + 1) * interval
 
 
-def _rows_until(path: Path, frames: int) -> list[dict[str, float]]:
+def _rows_until(path: Path, frames: int) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     rows = pd.read_csv(path, float_precision="round_trip").to_dict("records")

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
-from recipes.mujoco import Agent
+from recipes.mujoco_agent import Agent
 from recipes.runs import refuse_foreign
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
 from torchrl_priors.collectors import VectorCollector, make_vector_env

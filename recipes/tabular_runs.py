@@ -183,11 +183,17 @@ def learner_of(
     lr_weight: dict[str, float],
     td_error: str,
     bonus_coeff: float,
-    aux_coeff: float,
+    aux_coeff: float | None,
+    cross_entropy: str | None = None,
     schedule: np.ndarray | None = None,
 ) -> Learner:
-    """The learner of a method by name; ``lr_weight`` has a rate for each target of the prior weight."""
+    """The learner of a method by name; ``lr_weight`` has a rate for each target of the prior weight.
+
+    Where ``aux_coeff`` and ``cross_entropy`` are None they are the method's.
+    """
     spec = get_method(method)
+    aux_coeff = spec.aux_coeff if aux_coeff is None else aux_coeff
+    cross_entropy = spec.cross_entropy if cross_entropy is None else cross_entropy
     return Learner(
         gamma=float(gamma),
         lr=float(lr),
@@ -196,7 +202,7 @@ def learner_of(
         bonus_next=float(bonus_coeff * (spec.bonus == "next")),
         relative=spec.relative,
         aux_coeff=float(aux_coeff * spec.auxiliary),
-        teacher_mean=spec.cross_entropy == "teacher",
+        teacher_mean=cross_entropy == "teacher",
         adaptive=spec.adaptive,
         by_advantage=spec.weight_target == "advantage",
         shaped=td_error == "shaped",

@@ -45,8 +45,8 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *override
     """Start a run that is broken off after the rollout that ends at ``frames``."""
     log = recipe.Run.log
 
-    def stopping(self, at, *args):
-        log(self, at, *args)
+    def stopping(self, at, *args, **kwargs):
+        log(self, at, *args, **kwargs)
         if at == frames:
             raise Interrupted
 

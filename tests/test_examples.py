@@ -13,7 +13,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PARTS = {"catch.py"}  # imported by another
 SCRIPTS = sorted(path.name for path in EXAMPLES.glob("*.py") if path.name not in PARTS)
-FRAMES = {"a2c.py": 10_240, "ppo.py": 3200, "pixels.py": 1536, "from_yaml.py": 2048}
+FRAMES = {"a2c.py": 10_240, "ppo.py": 3200, "pixels.py": 1536, "trial.py": 10_240, "from_yaml.py": 2048}
 
 
 def run(name: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -41,3 +41,12 @@ def test_example_is_short_and_names_its_command(name: str) -> None:
     assert len(text.splitlines()) < 100
     assert f"    python examples/{name}\n" in text
     assert f"examples/{name}" in (EXAMPLES / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_example_of_a_trial_says_which_bot_won(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    pytest.importorskip("gymnasium")
+    run("trial.py", monkeypatch, "--frames=10240")
+    first = capsys.readouterr().out.splitlines()[0]
+    assert re.match(
+        r"(alone|good bot|weak bot) wins by .* after 8192 frames: alone .*, good bot .*, weak bot .*, bad bot", first
+    )

@@ -11,8 +11,8 @@ import torch
 from objectives_cases import DISTRIBUTIONS, make_actor, make_batch, make_critic, make_weight, total
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
 from torch import distributions as d
-from torch import nn
 from torchrl.data import Bounded
 from torchrl.modules import IndependentNormal, MaskedCategorical, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
@@ -24,7 +24,6 @@ from torchrl_priors import (
     ModulePrior,
     PriorBonus,
     PriorLogProb,
-    PriorTrust,
     PriorWeight,
     UniformPrior,
 )
@@ -74,14 +73,19 @@ def test_an_end_without_an_observation_leaves_no_trace(method: str, td_error: st
 
 
 def test_what_a_weight_learns_in_its_buffers_reaches_a_loss_that_was_moved() -> None:
-    trust = PriorTrust(3, listen=64, min_trust=0.5)
-    loss = AE2RLoss(make_actor(), make_actor(), trust, method="aligned", weight_target="none").to(torch.float64)
-    states = torch.randn(64, 3, dtype=torch.float64)
-    trust.update(states, 1 + torch.randn(64, 1, dtype=torch.float64))
-    assert trust.decided
-    assert loss.prior_weight is trust
+    class Level(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.register_buffer("level", torch.tensor(0.5))
+
+        def forward(self, observation: Tensor) -> Tensor:
+            return self.level.expand(*observation.shape[:-1], 1)
+
+    weight = TensorDictModule(Level(), in_keys=["observation"], out_keys=["prior_weight"])
+    loss = AE2RLoss(make_actor(), make_actor(), weight, method="aligned", weight_target="none").to(torch.float64)
+    weight.module.level.fill_(0.25)
     double = make_batch().apply(lambda x: x.double() if x.is_floating_point() else x)
-    torch.testing.assert_close(loss(double)["prior_weight"], trust(double.clone())["prior_weight"].mean())
+    assert loss(double)["prior_weight"] == 0.25
 
 
 def test_the_offset_reaches_the_values_of_the_loop_after_a_move() -> None:

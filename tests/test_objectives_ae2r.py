@@ -21,7 +21,7 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
 from torchrl_priors.methods import METHODS
-from torchrl_priors.objectives import AE2RLoss
+from torchrl_priors.objectives import AE2RLoss, cross_entropy
 
 ADAPTIVE = [name for name, spec in METHODS.items() if spec.adaptive]
 
@@ -122,6 +122,8 @@ def test_aligned_by_hand(two_states):
     # (A - w (log pi0 + H^X))^2 with A = delta = 1
     expected = torch.tensor([(1 - 0.25 * (-1 + 0.836988)) ** 2, (1 - 0.75 * (-2 + 0.693147)) ** 2])
     torch.testing.assert_close(losses["loss_prior_weight"], expected)
+    # the auxiliary loss averages over the teacher's actions, see below
+    torch.testing.assert_close(losses["loss_prior"], torch.tensor([0.25 * math.log(2.0), 0.75 * 0.836988]))
     data["raw_advantage"] = torch.tensor([[2.0], [4.0]])
     losses = AE2RLoss(**networks, method="aligned", gamma=0.5, reduction="none")(data)
     expected = torch.tensor([(2 - 0.25 * (-1 + 0.836988)) ** 2, (4 - 0.75 * (-2 + 0.693147)) ** 2])
@@ -147,6 +149,42 @@ def test_the_teachers_cross_entropy_of_gaussians_pulls_the_spread_to_the_teacher
     student, teacher = (net.get_dist(data.copy()) for net in (loss.actor_network, loss.prior))
     expected = torch.distributions.kl_divergence(teacher, student) + teacher.entropy()
     torch.testing.assert_close(loss(data)["loss_prior"], expected.mean())
+
+
+@pytest.mark.parametrize("kind", ["categorical", "normal", "tanh_normal"])
+def test_a_share_of_the_entropy_leads_from_the_cross_entropy_to_the_divergence(kind):
+    data, actor, prior = make_batch(kind), make_actor(kind), make_actor(kind)
+
+    def loss(**options):
+        module = AE2RLoss(actor, prior, method="kickstart", functional=False, num_samples=64, **options)
+        torch.manual_seed(0)
+        value = module(data)["loss_prior"]
+        return value, torch.cat([g.flatten() for g in torch.autograd.grad(value, list(actor.parameters()))])
+
+    (plain, _), (none, slope), (half, _), (full, end) = (
+        loss(**options) for options in ({}, {"kl_share": 0.0}, {"kl_share": 0.5}, {"kl_share": 1.0})
+    )
+    divergence = cross_entropy(actor.get_dist(data), prior.get_dist(data), num_samples=64).mean()
+    if kind != "tanh_normal":  # whose two parts are sampled apart
+        entropy = actor.get_dist(data).entropy().mean()
+        divergence = divergence - entropy
+        torch.testing.assert_close(none, plain)
+        torch.testing.assert_close(full, divergence)
+        torch.testing.assert_close(half, (none + full) / 2)
+        towards = torch.cat([g.flatten() for g in torch.autograd.grad(entropy, list(actor.parameters()))])
+        torch.testing.assert_close(slope - end, towards)
+    assert none.isfinite()
+    assert full.isfinite()
+
+
+def test_a_share_of_the_entropy_is_of_the_students_cross_entropy_only():
+    with pytest.raises(ValueError, match="kl_share is for a cross-entropy of the student's actions"):
+        make_loss("pull", kl_share=0.5)
+    with pytest.raises(ValueError, match=r"kl_share must be in \[0, 1\], got 2"):
+        make_loss("kickstart", kl_share=2)
+    assert make_loss("pull").aux_coeff == pytest.approx(0.3)
+    assert make_loss("pull", aux_coeff=0.1).aux_coeff == pytest.approx(0.1)
+    assert make_loss("kickstart").aux_coeff == 1
 
 
 def test_centred_bonus_by_hand(two_states):

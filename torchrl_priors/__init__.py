@@ -4,6 +4,7 @@ from torchrl_priors.artifacts import load_prior, load_sb3_prior, save_prior
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
 from torchrl_priors.hooks import PriorShaping
+from torchrl_priors.let_go import LetGo
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 from torchrl_priors.metrics import (
     area_ratio,
@@ -22,7 +23,6 @@ from torchrl_priors.objectives import (
     ValueOffset,
     cross_entropy,
 )
-from torchrl_priors.prior_trust import PriorTrust, advice_evidence
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import (
     ActionPrior,
@@ -34,6 +34,7 @@ from torchrl_priors.priors import (
     UniformPrior,
 )
 from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
+from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 from torchrl_priors.transforms import PriorBonus, PriorLogProb, multi_teacher_transforms
 
 __all__ = [
@@ -49,6 +50,7 @@ __all__ = [
     "CosineSchedule",
     "GridWorldEnv",
     "GridWorlds",
+    "LetGo",
     "LinearSchedule",
     "MethodSpec",
     "MixturePrior",
@@ -58,13 +60,13 @@ __all__ = [
     "PriorBonus",
     "PriorLogProb",
     "PriorShaping",
-    "PriorTrust",
     "PriorWeight",
     "RandomDegradation",
     "StructuralDegradation",
+    "TeacherTrial",
+    "TrialResult",
     "UniformPrior",
     "ValueOffset",
-    "advice_evidence",
     "area_ratio",
     "area_under_curve",
     "cross_entropy",

@@ -17,9 +17,7 @@ __all__ = [
     "alignment",
     "categorical_cross_entropy",
     "categorical_entropy",
-    "categorical_log_prob_std",
     "gaussian_cross_entropy",
-    "gaussian_log_prob_std",
     "has_next_action",
     "joint",
     "policy_gradient_loss",
@@ -80,50 +78,6 @@ def gaussian_cross_entropy(loc: Tensor, scale: Tensor, prior_loc: Tensor, prior_
     half_log_2pi = 0.9189385332046727
     quadratic = (scale.square() + (loc - prior_loc).square()) / (2 * prior_scale.square())
     return (quadratic + prior_scale.log() + half_log_2pi).sum(-1)
-
-
-def categorical_log_prob_std(log_probs: Tensor, prior_log_probs: Tensor) -> Tensor:
-    r"""Spread of the prior's log-probability over the student's actions, :math:`\mathrm{std}_{a\sim\pi}[\log\pi_0(a)]`.
-
-    Args:
-        log_probs (Tensor): normalised log-probabilities of the student, ``[*B, A]``.
-        prior_log_probs (Tensor): normalised log-probabilities of the prior, ``[*B, A]``, finite.
-
-    Returns:
-        Tensor: nats, ``[*B]``.
-
-    Examples:
-        >>> categorical_log_prob_std(torch.tensor([0.5, 0.5]).log(), torch.tensor([-1.0, -3.0]))
-        tensor(1.)
-    """
-    probs = log_probs.exp()
-    mean = (probs * prior_log_probs).sum(-1, keepdim=True)
-    return (probs * (prior_log_probs - mean).square()).sum(-1).sqrt()
-
-
-def gaussian_log_prob_std(loc: Tensor, scale: Tensor, prior_loc: Tensor, prior_scale: Tensor) -> Tensor:
-    r"""The same of diagonal Gaussians.
-
-    .. math:: \sqrt{\sum_i \frac{\sigma_i^2(\mu_i-\mu_{0i})^2}{\sigma_{0i}^4} + \frac{\sigma_i^4}{2\sigma_{0i}^4}}
-
-    :math:`\log\pi_0(a)` is quadratic in :math:`a=\mu+\sigma z`; the two terms are the variances of its parts in
-    :math:`z` and :math:`z^2`.
-
-    Args:
-        loc, scale (Tensor): of the student, ``[*B, A]``.
-        prior_loc, prior_scale (Tensor): of the prior, ``[*B, A]``.
-
-    Returns:
-        Tensor: nats, ``[*B]``.
-
-    Examples:
-        >>> zero, one = torch.zeros(1), torch.ones(1)
-        >>> round(gaussian_log_prob_std(zero, one, zero, one).item(), 4)  # of -z^2 / 2
-        0.7071
-    """
-    ratio = (scale / prior_scale).square()
-    distance = (loc - prior_loc) / prior_scale
-    return (ratio * distance.square() + 0.5 * ratio.square()).sum(-1).sqrt()
 
 
 def has_next_action(done: Tensor, traj_ids: Tensor | None = None, *, time_dim: int) -> Tensor:

@@ -23,6 +23,7 @@ class MethodSpec:
             mean minus the divergence KL(pi || pi0). Of ``bonus="current"`` without a learned weight only.
         cross_entropy: whose actions the auxiliary loss averages over: the ``"student"``'s, H^X(pi || pi0), or the
             ``"teacher"``'s, H^X(pi0 || pi).
+        aux_coeff: the coefficient of the auxiliary loss where none is given.
         annealed: whether the method's coefficients are meant to go to 0 over training. Whoever runs the loop does that,
             with a :class:`~torchrl_priors.schedules.CoeffScheduler`; losses and transforms do not read it.
     """
@@ -33,6 +34,7 @@ class MethodSpec:
     weight_target: Literal["td", "advantage"] = "td"
     relative: bool = False
     cross_entropy: Literal["student", "teacher"] = "student"
+    aux_coeff: float = 1.0
     annealed: bool = False
 
     def __post_init__(self) -> None:
@@ -49,7 +51,10 @@ METHODS: dict[str, MethodSpec] = {
     "ae2r": MethodSpec(bonus="next", auxiliary=True, adaptive=True),
     # beyond the paper
     "kickstart": MethodSpec(bonus="none", auxiliary=True, adaptive=False),
-    "aligned": MethodSpec(bonus="none", auxiliary=True, adaptive=True, weight_target="advantage"),
+    "pull": MethodSpec(bonus="none", auxiliary=True, adaptive=False, cross_entropy="teacher", aux_coeff=0.3),
+    "aligned": MethodSpec(
+        bonus="none", auxiliary=True, adaptive=True, weight_target="advantage", cross_entropy="teacher"
+    ),
     # the field's baselines: Schmitt et al., "Kickstarting Deep Reinforcement Learning" (2018), with a schedule in place
     # of population-based training; and the KL penalty in the reward of KL-regularised RL, e.g. Teh et al., "Distral"
     # (2017), Galashov et al., "Information asymmetry in KL-regularized RL" (2019)

@@ -6,9 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+
+from torchrl_priors.episode_returns import EpisodeReturns, welch
 
 __all__ = ["TeacherTrial", "TrialResult"]
 
@@ -61,7 +62,7 @@ class TeacherTrial:
         alone (str): the arm without a teacher. Defaults to the first one.
         alpha (float): probability of dropping an arm though it is no worse. Defaults to 0.05.
         min_frames (int, optional): of each arm before the first decision. Learning curves cross, and a test can't see
-            that: on Hopper the student of a bad teacher leads at 4096 frames and is clearly behind at 24576. Defaults$
+            that: on Hopper the student of a bad teacher leads at 4096 frames and is clearly behind at 24576. Defaults
             to half of ``max_frames``.
         recent (float): the share of an arm's frames in which recent episodes ended. Defaults to 0.25.
         min_episodes (int): recent episodes of each arm before a decision. Defaults to 8.
@@ -120,12 +121,11 @@ class TeacherTrial:
         if not 0 <= min_frames <= max_frames:
             raise ValueError(f"min_frames must be between 0 and max_frames={max_frames}, got {min_frames}.")
         self.max_frames, self.alpha, self.min_frames, self.min_episodes = max_frames, alpha, min_frames, min_episodes
-        self.return_key, self.done_key, self.recent = return_key, done_key, recent
+        self.recent = recent
         self.active = list(self.arms)
-        self.frames = dict.fromkeys(self.arms, 0)
         self.result: TrialResult | None = None
         self._round = 0  # frames of an arm at the first look
-        self._episodes: dict[str, list[tuple[int, float]]] = {arm: [] for arm in self.arms}
+        self._returns = {arm: EpisodeReturns(return_key=return_key, done_key=done_key, name=arm) for arm in self.arms}
 
     def update(self, arm: str, batch: TensorDictBase) -> None:
         """Read the returns of the episodes that ended in a batch.
@@ -140,19 +140,12 @@ class TeacherTrial:
         """
         if arm not in self.active:
             raise KeyError(f"{arm!r} is not in the trial any more, or never was: active are {self.active}.")
-        ended, returns = (self._entry(batch, key).reshape(-1) for key in (self.done_key, self.return_key))
-        finished = returns[ended.bool()].double()
-        if not finished.isfinite().all():
-            raise ValueError(f"{arm!r} has an episode whose return, under {self.return_key!r}, is not finite.")
-        self.frames[arm] += batch.numel()
-        self._episodes[arm] += [(self.frames[arm], value) for value in finished.tolist()]
+        self._returns[arm].update(batch)
 
-    @staticmethod
-    def _entry(batch: TensorDictBase, key: NestedKey) -> Tensor:
-        value = batch.get(key, None)
-        if value is None:
-            raise KeyError(f"The batch has no {key!r}. TorchRL's RewardSum writes the returns of episodes.")
-        return value
+    @property
+    def frames(self) -> dict[str, int]:
+        """That each arm has made."""
+        return {arm: returns.frames for arm, returns in self._returns.items()}
 
     def decide(self) -> TrialResult | None:
         """Drop the arms that are clearly behind; the result as soon as there is one.
@@ -186,8 +179,8 @@ class TeacherTrial:
 
     def recent_returns(self, arm: str) -> Tensor:
         """Returns of an arm's recent episodes, float64 ``[N]``."""
-        start = self.frames[arm] * (1 - self.recent)
-        return torch.tensor([value for frame, value in self._episodes[arm] if frame > start], dtype=torch.float64)
+        returns = self._returns[arm]
+        return returns.within(returns.frames * self.recent)
 
     def _drop(self, recent: Mapping[str, Tensor]) -> float:
         """Take the arms out that are clearly behind another one; how sure the least sure of these decisions is."""
@@ -214,8 +207,7 @@ class TeacherTrial:
         return {
             "active": list(self.active),
             "round": self._round,
-            "frames": dict(self.frames),
-            "episodes": {arm: [list(episode) for episode in episodes] for arm, episodes in self._episodes.items()},
+            "returns": {arm: returns.state_dict() for arm, returns in self._returns.items()},
             "result": None if self.result is None else self.result._asdict(),
         }
 
@@ -225,19 +217,19 @@ class TeacherTrial:
         Raises:
             ValueError: it was one of other arms.
         """
-        if list(state_dict["frames"]) != self.arms:
-            raise ValueError(f"The saved trial is of {list(state_dict['frames'])}, this one of {self.arms}.")
-        self.active, self.frames = list(state_dict["active"]), dict(state_dict["frames"])
-        self._round = int(state_dict["round"])
-        self._episodes = {arm: [(int(f), float(v)) for f, v in seen] for arm, seen in state_dict["episodes"].items()}
+        saved = state_dict["returns"]
+        if set(saved) != set(self.arms):
+            raise ValueError(f"The saved trial is of {sorted(saved)}, this one of {sorted(self.arms)}.")
+        self.active, self._round = list(state_dict["active"]), int(state_dict["round"])
+        for arm, returns in self._returns.items():
+            returns.load_state_dict(saved[arm])
         result = state_dict["result"]
         self.result = None if result is None else TrialResult(**result)
 
 
 def _tail(better: Tensor, worse: Tensor) -> float:
     """Probability of a Welch statistic as large as this where the means are equal, by the normal distribution."""
-    spread = math.sqrt(float(better.var() / len(better) + worse.var() / len(worse)))
-    difference = float(better.mean() - worse.mean())
-    if spread == 0:
+    difference, error = welch(better, worse)
+    if error == 0:
         return 0.0 if difference > 0 else 1.0
-    return 0.5 * math.erfc(difference / spread / math.sqrt(2))
+    return 0.5 * math.erfc(difference / error / math.sqrt(2))

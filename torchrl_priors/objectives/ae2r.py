@@ -26,7 +26,7 @@ from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.priors import ActionPrior
 
 from .batch import check_option, keep_where, out_key, under_next, weight_regression
-from .cross_entropy import cross_entropy_and_kl, cross_entropy_of_advice
+from .cross_entropy import cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
 
 __all__ = ["AE2RLoss"]
 
@@ -40,7 +40,8 @@ class AE2RLoss(LossModule):
 
     * ``"loss_prior"``, :math:`c_{aux}\,\mathrm{sg}[\omega(s_t)]\,H^X_{s_t}(\pi\|\pi_0)`, which reaches the actor only;
       being a cross-entropy and no divergence, it pulls towards the prior's best action, not to its entropy (that of
-      ``"annealed_kickstart"`` is :math:`H^X_{s_t}(\pi_0\|\pi)`, which pulls towards the prior itself);
+      ``"pull"``, ``"aligned"`` and ``"annealed_kickstart"`` is :math:`H^X_{s_t}(\pi_0\|\pi)`, which pulls towards
+      the prior itself);
     * ``"loss_prior_weight"``, :math:`c_\omega\,(y - \omega(s)\,\ell)^2`, which reaches the prior weight only;
     * ``"loss_prior_critic"``, :math:`c_V\,(V(s_t) - \mathrm{sg}[R_t + \gamma(1-\mathrm{term}_t)V(s_{t+1})])^2`, which
       reaches the critic of raw rewards only (``td_error="original"``).
@@ -81,7 +82,12 @@ class AE2RLoss(LossModule):
         centering (str): ``"none"``, or ``"prior"`` or ``"policy"`` if the bonus is centred; the centre is read from the
             batch. Defaults to ``"none"``.
         bonus_coeff (float): coefficient of the bonus in the shaped reward. Defaults to 1.0.
-        aux_coeff (float): coefficient of ``loss_prior``. Defaults to 1.0.
+        aux_coeff (float, optional): coefficient of ``loss_prior``. Defaults to ``None``: the method's, 0.3 of
+            ``"pull"`` and 1.0 of the others.
+        kl_share (float, optional): how much of the student's entropy is given back, :math:`\eta` in
+            :math:`H^X(\pi\|\pi_0)-\eta H(\pi)`: from 0, the cross-entropy, to 1, the divergence
+            :math:`\mathrm{KL}(\pi\|\pi_0)`. A buffer, as the coefficients are, for :class:`~torchrl_priors.LetGo`;
+            not for the methods that average over the teacher's actions. Defaults to ``None``: there is no such term.
         weight_coeff (float): coefficient of ``loss_prior_weight``. Defaults to 1.0.
         critic_coeff (float): coefficient of ``loss_prior_critic``. Defaults to 1.0.
         gamma (float): discount. Defaults to 0.99.
@@ -168,7 +174,7 @@ class AE2RLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     _schedulable_buffers: ClassVar[frozenset[str]] = frozenset(
-        {"bonus_coeff", "aux_coeff", "weight_coeff", "critic_coeff", "gamma"}
+        {"bonus_coeff", "aux_coeff", "kl_share", "weight_coeff", "critic_coeff", "gamma"}
     )
 
     actor_network: TensorDictModule
@@ -193,7 +199,8 @@ class AE2RLoss(LossModule):
         weight_target: Literal["td", "advantage", "none"] | None = None,
         centering: Literal["none", "prior", "policy"] = "none",
         bonus_coeff: float = 1.0,
-        aux_coeff: float = 1.0,
+        aux_coeff: float | None = None,
+        kl_share: float | None = None,
         weight_coeff: float = 1.0,
         critic_coeff: float = 1.0,
         gamma: float = 0.99,
@@ -213,8 +220,11 @@ class AE2RLoss(LossModule):
             raise TypeError(f"The prior must be an ActionPrior or a policy, got {type(prior).__name__}.")
         if prior_in_batch and not isinstance(prior, ActionPrior):
             raise ValueError(f"prior_in_batch=True needs an ActionPrior as prior, got {type(prior).__name__}.")
-        if not 0.0 <= gamma <= 1.0:
-            raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
+        for name, share in (("gamma", gamma), ("kl_share", kl_share)):
+            if share is not None and not 0.0 <= share <= 1.0:
+                raise ValueError(f"{name} must be in [0, 1], got {share}.")
+        if kl_share is not None and spec.cross_entropy == "teacher":
+            raise ValueError(f"kl_share is for a cross-entropy of the student's actions: {method!r} has the teacher's.")
         if spec.adaptive:
             if prior_weight is None:
                 raise ValueError(f"The method {method!r} learns a prior weight: pass prior_weight.")
@@ -269,12 +279,15 @@ class AE2RLoss(LossModule):
         device = next((parameter.device for parameter in self.parameters()), None)
         for name, value in (
             ("bonus_coeff", bonus_coeff),
-            ("aux_coeff", aux_coeff),
+            ("aux_coeff", spec.aux_coeff if aux_coeff is None else aux_coeff),
             ("weight_coeff", weight_coeff),
             ("critic_coeff", critic_coeff),
             ("gamma", gamma),
         ):
             self.register_coeff_buffer(name, value, device=device)
+        self._shares_entropy = kl_share is not None
+        if kl_share is not None:
+            self.register_coeff_buffer("kl_share", kl_share, device=device)
         if spec.adaptive and prior_weight is not None:
             self.set_keys(prior_weight=out_key(prior_weight, self.tensor_keys.prior_weight))
         if self._has_critic and critic_network is not None:
@@ -409,6 +422,9 @@ class AE2RLoss(LossModule):
             auxiliary = entropy
             if teacher:
                 auxiliary = cross_entropy_of_advice(prior_dist, dist, num_samples=self.num_samples)
+            elif self._shares_entropy:
+                divergence = kl_divergence(dist, prior_dist, num_samples=self.num_samples)
+                auxiliary = torch.lerp(entropy, divergence, self.kl_share)
         ndim = tensordict.ndim or entropy.ndim  # what dispatch makes has no batch size
         return joint(entropy, ndim), joint(auxiliary, ndim), joint(kl, ndim)
 

@@ -44,8 +44,8 @@ class ClipPPOPriorLoss(ClipPPOLoss):
             by the adaptive methods with ``td_error="original"``. With ``"shaped"``, ``critic_network`` is in its place.
 
     Keyword Args:
-        method, td_error, weight_target, centering, bonus_coeff, aux_coeff, weight_coeff, num_samples, prior_in_batch:
-            as for :class:`AE2RLoss`. To schedule a coefficient, assign it on ``prior_loss``:
+        method, td_error, weight_target, centering, bonus_coeff, aux_coeff, kl_share, weight_coeff, num_samples,
+            prior_in_batch: as for :class:`AE2RLoss`. To schedule a coefficient, assign it on ``prior_loss``:
             ``loss.prior_loss.aux_coeff = 0.5``.
         prior_critic_coeff (float): coefficient of ``loss_prior_critic``. Defaults to 1.0.
         gamma (float): discount, of the prior weight's loss and of the value estimator
@@ -125,7 +125,8 @@ class ClipPPOPriorLoss(ClipPPOLoss):
         weight_target: Literal["td", "advantage", "none"] | None = None,
         centering: Literal["none", "prior", "policy"] = "none",
         bonus_coeff: float = 1.0,
-        aux_coeff: float = 1.0,
+        aux_coeff: float | None = None,
+        kl_share: float | None = None,
         weight_coeff: float = 1.0,
         prior_critic_coeff: float = 1.0,
         gamma: float = 0.99,
@@ -147,6 +148,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
             centering=centering,
             bonus_coeff=bonus_coeff,
             aux_coeff=aux_coeff,
+            kl_share=kl_share,
             weight_coeff=weight_coeff,
             critic_coeff=prior_critic_coeff,
             gamma=gamma,

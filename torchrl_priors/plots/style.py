@@ -76,11 +76,13 @@ _METHODS = {
     "ae2r": ("AE2R", "#0072B2"),
     "kickstart": ("Kickstart", "#CC79A7"),
     "aligned": ("Aligned", "#009E73"),
+    "trial": ("Trial", "#117733"),
     # of Tol's muted palette, for there are no more in that one
     "annealed_kickstart": ("Annealed kickstart", "#882255"),
     "kl_penalty": ("KL penalty", "#999933"),
+    "pull": ("Pull", "#332288"),
 }
-_OTHER_COLORS = ("#44AA99", "#332288", "#AA4499", "#661100")
+_OTHER_COLORS = ("#44AA99", "#DDCC77", "#AA4499", "#661100")
 
 
 def method_label(name: str) -> str:
