@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -56,11 +58,11 @@ def tables(path: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory) -> Path:
-    """Every method of the library with every prior of the paper, on three worlds, by the command."""
+    """Every method of the library with every prior of the paper, on three worlds."""
     out = tmp_path_factory.mktemp("study") / "small"
-    done = subprocess.run(command("worlds=3", f"out={out}"), cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    (out / "stdout.txt").write_text(done.stdout)
+    with redirect_stdout(StringIO()) as said:
+        assert recipe("worlds=3", f"out={out}") == 0
+    (out / "stdout.txt").write_text(said.getvalue())
     return out
 
 
