@@ -47,6 +47,16 @@ def generator() -> torch.Generator:
 
 
 @pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made but not drawn, which takes a second each: there is nothing to see in their files.
+
+    For what else a recipe does. That its figures can be drawn is seen where a study or a report is looked at whole.
+    """
+    style = pytest.importorskip("torchrl_priors.plots.style")
+    monkeypatch.setattr(style, "_pictures", lambda figure, formats, dpi: [b"not drawn"] * len(formats))
+
+
+@pytest.fixture
 def without_torchrls_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once ``register_configs`` has run in a process, Hydra knows TorchRL's hundreds of configs beside the recipes'.
 

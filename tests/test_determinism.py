@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
@@ -18,21 +19,38 @@ GRIDWORLD += ["teacher.steps=300", "teacher.eval_episodes=2", "evaluation.points
 GRIDWORLD += ["bootstrap.reps=20", "seed=3"]
 
 
-def files(recipe: str, overrides: list[str], out: Path, hash_seed: int) -> dict[str, bytes]:
-    """What a fresh process writes that is told to be reproducible: tables and policies, no times and no pictures."""
-    command = [sys.executable, "-m", f"recipes.{recipe}", *overrides, f"out={out}"]
-    environment = {**os.environ, "PYTHONHASHSEED": str(hash_seed)}
+def run_here(recipe: str, *arguments: str) -> None:
+    """Run a recipe in this process, which has done other things before."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
+        patch.setattr(sys, "argv", [recipe, *arguments])
+        importlib.import_module(f"recipes.{recipe}").main()
+
+
+def run_elsewhere(recipe: str, *arguments: str) -> None:
+    """Run it in a fresh process, with another hash seed than this one has."""
+    hash_seed = "2" if os.environ.get("PYTHONHASHSEED") == "1" else "1"
+    command = [sys.executable, "-m", f"recipes.{recipe}", *arguments]
+    environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def files(out: Path) -> dict[str, bytes]:
+    """What is told to be reproducible: tables and policies, no times and no pictures."""
     kept = [path for path in out.glob("*") if path.suffix in (".csv", ".safetensors", ".npz")]
     return {path.name: path.read_bytes() for path in kept if path.name != "metrics.csv"}  # has frames per second
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize(("recipe", "overrides"), [("mujoco", MUJOCO), ("gridworld", GRIDWORLD)])
 def test_two_processes_write_the_same_bytes(recipe: str, overrides: list[str], tmp_path: Path) -> None:
     if recipe == "mujoco":
         pytest.importorskip("mujoco")
-    first, second = (files(recipe, overrides, tmp_path / str(seed), seed) for seed in (1, 2))
+    run_here(recipe, *overrides, f"out={tmp_path / 'here'}")
+    run_elsewhere(recipe, *overrides, f"out={tmp_path / 'elsewhere'}")
+    first, second = files(tmp_path / "here"), files(tmp_path / "elsewhere")
     assert {"eval.csv", "policy.safetensors"} <= first.keys() or {"area_ratio.csv", "worlds.csv"} <= first.keys()
     assert first.keys() == second.keys()
     assert [name for name in first if first[name] != second[name]] == []

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 import torch
-from matplotlib.figure import Figure
 from test_readme import a_readers_own_objects
 from torchrl.objectives.value import GAE
 
@@ -48,7 +47,6 @@ def run(command: str, folder: Path) -> int | str | None:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
-        patch.setattr(Figure, "savefig", lambda *args, **kwargs: None)  # slow, tested elsewhere
         patch.setattr(sys, "argv", [words[2], *words[3:], *SHORT[words[2]].split(), *more])
         try:
             importlib.import_module(words[2]).main()
@@ -61,6 +59,7 @@ def test_every_block_is_of_a_language_that_is_run() -> None:
     assert {name for text in PAGES.values() for name, _ in BLOCK.findall(text)} == {"bash", "python"}
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("page", blocks("bash"))
 def test_commands_run_in_their_order(page: str, tmp_path: Path) -> None:
     for code in blocks("bash")[page]:

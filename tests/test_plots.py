@@ -154,11 +154,6 @@ assert "matplotlib.pyplot" not in sys.modules
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_library_does_not_need_matplotlib():
-    code = "import sys; sys.modules['matplotlib'] = None; import torchrl_priors, torchrl_priors.metrics"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 class TestNames:
     def test_every_method_has_a_colour_and_a_label_of_its_own(self):
         assert len({method_color(m) for m in METHODS}) == len({method_label(m) for m in METHODS}) == len(METHODS)

@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -56,11 +58,11 @@ def tables(path: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory) -> Path:
-    """Every method of the library with every prior of the paper, on three worlds, by the command."""
+    """Every method of the library with every prior of the paper, on three worlds."""
     out = tmp_path_factory.mktemp("study") / "small"
-    done = subprocess.run(command("worlds=3", f"out={out}"), cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    (out / "stdout.txt").write_text(done.stdout)
+    with redirect_stdout(StringIO()) as said:
+        assert recipe("worlds=3", f"out={out}") == 0
+    (out / "stdout.txt").write_text(said.getvalue())
     return out
 
 
@@ -149,6 +151,7 @@ def test_finished_run_only_reports_again(small):
     assert {file: file.stat().st_mtime_ns for file in (small / "blocks").iterdir()} == written
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("study", sorted(file.stem for file in (ROOT / "conf" / "study").glob("*.yaml")))
 def test_every_study_runs_and_the_shaped_reading_too(study, tmp_path):
     out = tmp_path / study
@@ -173,12 +176,14 @@ def five(tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize("how", [("workers=2",), ("workers=3", "block_worlds=2")])
 def test_results_do_not_depend_on_how_the_work_is_divided(five, how, tmp_path):
     assert recipe(*FIVE, *how, f"out={tmp_path / 'again'}") == 0
     assert tables(tmp_path / "again") == tables(five)
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_worlds_are_the_same_in_a_larger_study(small, tmp_path):
     out = tmp_path / "more"
     assert recipe("worlds=4", "seed=1", "priors=[structural_3]", "methods=[none,aer]", f"out={out}") == 0
@@ -258,6 +263,7 @@ def test_folder_of_another_configuration_is_refused_and_left_alone(small, overri
     assert contents(small) == before
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_damaged_block_is_named_and_nothing_is_lost(five, tmp_path, capfd):
     copy = tmp_path / "copy"
     shutil.copytree(five, copy)
@@ -287,6 +293,7 @@ def test_default_folder_differs_for_each_configuration(tmp_path):
     assert paths[2] != paths[0]
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_killed_run_continues_to_the_same_tables(tmp_path):
     whole, out = tmp_path / "whole", tmp_path / "killed"
     assert recipe(*LONG, f"out={whole}") == 0

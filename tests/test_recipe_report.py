@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from report_cases import POINTS, ROOT, config, spoil, write_run, write_study
+from report_cases import POINTS, config, spoil, write_run, write_study
 
-from recipes.report import report
+from recipes.report import main, report
 from recipes.report_markdown import number, table
 from recipes.report_runs import find, name_groups, read, without_misfits
 from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
@@ -56,7 +54,10 @@ def test_a_report_has_every_table_and_figure_and_names_what_it_left_out(tmp_path
 
 
 def test_a_report_is_the_same_every_time(tmp_path: Path) -> None:
-    root = write_study(tmp_path / "runs", envs=("Hopper",), seeds=2)
+    root = tmp_path / "runs"
+    for method in ("none", "e2r", "ae2r"):
+        for seed in range(2):
+            write_run(root / f"{method}{seed}", method=method, seed=seed)
     out = report(config(f"runs={root}", f"out={tmp_path / 'out'}")).parent
     before = {file.name: file.read_bytes() for file in out.iterdir()}
     report(config(f"runs={root}", f"out={out}"))
@@ -165,6 +166,7 @@ def test_aggregates_need_every_environment_and_say_who_is_missing(tmp_path: Path
     assert set(improvement[improvement["env"] == ALL]["method"]) == {"e2r"}
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_without_a_baseline_there_are_returns_but_no_ratios(tmp_path: Path) -> None:
     write_run(tmp_path / "runs" / "a", method="e2r")
     page = report(config(f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}")).read_text()
@@ -269,15 +271,18 @@ def test_a_wrong_key_is_refused_by_name(tmp_path: Path, override: str) -> None:
         report(config(f"runs={tmp_path}", f"out={tmp_path / 'out'}", override))
 
 
-def test_nothing_but_unusable_runs_is_an_error_with_a_message_only(tmp_path: Path) -> None:
+def test_nothing_but_unusable_runs_is_an_error_with_a_message_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_run(tmp_path / "a", status={"state": "running"})
-    command = [sys.executable, "-m", "recipes.report", f"runs={tmp_path}", f"out={tmp_path / 'out'}"]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert result.returncode == 1
-    assert "none of the 1 runs" in result.stderr
-    assert "not finished" in result.stderr
-    assert "Traceback" not in result.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
+    monkeypatch.setattr(sys, "argv", ["report", f"runs={tmp_path}", f"out={tmp_path / 'out'}"])
+    with pytest.raises(SystemExit, match="none of the 1 runs"):  # a text: status 1
+        main()
+    said = capsys.readouterr().err
+    assert "not finished" in said
+    assert "Traceback" not in said
     assert not (tmp_path / "out").exists()
 
 

@@ -38,6 +38,7 @@ def test_a_gridworld_table_with_a_hole_is_refused_by_name(tmp_path: Path) -> Non
         report(config(f"runs={folder}", f"out={tmp_path / 'out'}"))
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_studies_and_runs_together_get_a_page_each_and_an_index(tmp_path: Path) -> None:
     write_run(tmp_path / "runs" / "a")
     index = report(config(f"runs=[{tmp_path / 'runs'},{GRIDWORLD}]", f"out={tmp_path / 'out'}")).read_text()
@@ -45,6 +46,7 @@ def test_studies_and_runs_together_get_a_page_each_and_an_index(tmp_path: Path) 
     assert "(report.md)" in index
 
 
+@pytest.mark.usefixtures("without_pictures")
 def test_studies_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
     for name in ("a/study", "b/study"):
         write_study(tmp_path / name)
@@ -54,6 +56,7 @@ def test_studies_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> 
         assert str(tmp_path / name) in (index.parent / name / "report.md").read_text()
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize(
     ("file", "content"),
     [("area_ratio.csv", None), ("curves.csv", b"\xff"), ("config.yaml", b"worlds: \xff"), ("config.yaml", b"a: [")],

@@ -11,8 +11,10 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch._guards import TracingContext, tracing
 from torch._inductor import standalone_compile
 from torch._ops import OpOverload
+from torch._subclasses import FakeTensorMode
 from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing, make_fx
 from torch.overrides import TorchFunctionMode
@@ -217,7 +219,9 @@ class CompiledStep:
                     _adam(parameter, mean, square, gradient, factors[i], group["betas"], group["eps"])
             return torch.stack([value.detach().mean() for value in losses.values()])
 
-        with torch.random.fork_rng(devices=[]), _Decided():
+        # Each operation is noted with fakes of its results: of one mode for all, as to make a mode takes as long.
+        fakes = tracing(TracingContext(FakeTensorMode(allow_fallback_kernels=True)))
+        with torch.random.fork_rng(devices=[]), _Decided(), fakes:
             graph = make_fx(step, decomposition_table=_FASTER)(*(tensor.clone() for tensor in inputs))
         graph.graph.eliminate_dead_code()
         graph.recompile()

@@ -6,7 +6,7 @@ import functools
 import io
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -234,27 +234,33 @@ def save_figure(
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
+    written = []
+    for suffix, content in zip(formats, _pictures(figure, formats, dpi), strict=True):
+        file = target.with_name(f"{target.name}.{suffix}")
+        _replace(file, content)
+        written.append(file)
+    return written
+
+
+def _pictures(figure: Figure, formats: Sequence[str], dpi: int) -> Iterator[bytes]:
+    """The content of the files, one by one. Layout and crop, which take as long as the rest, are found once for all."""
     undated: dict[str, dict[str, Any]] = {
         "pdf": {"CreationDate": None},
         "svg": {"Date": None},
         "png": {"Software": None},
     }
-    written = []
-    for suffix in formats:
-        buffer = io.BytesIO()
-        with mpl.rc_context({"svg.hashsalt": "torchrl_priors"}):
-            figure.savefig(
-                buffer,
-                format=suffix,
-                dpi=dpi,
-                bbox_inches="tight",
-                pad_inches=0.03,
-                metadata=undated.get(suffix),
-            )
-        file = target.with_name(f"{target.name}.{suffix}")
-        _replace(file, buffer.getvalue())
-        written.append(file)
-    return written
+    figure.draw_without_rendering()
+    crop = figure.get_tightbbox().padded(0.03)
+    engine = figure.get_layout_engine()
+    figure.set_layout_engine("none")
+    try:
+        for suffix in formats:
+            buffer = io.BytesIO()
+            with mpl.rc_context({"svg.hashsalt": "torchrl_priors"}):
+                figure.savefig(buffer, format=suffix, dpi=dpi, bbox_inches=crop, metadata=undated.get(suffix))
+            yield buffer.getvalue()
+    finally:
+        figure.set_layout_engine(engine)
 
 
 def _replace(file: Path, content: bytes) -> None:
