@@ -51,7 +51,7 @@ class LetGo:
     Keyword Args:
         window (int): frames.
         rest (str, optional): of the buffer to be kept at :math:`1-c`. Defaults to None.
-        rate (float): how often :math:`c` is halved in a window, at first. Defaults to 2.
+        rate (float): how often :math:`c` is halved in a window, at first. Defaults to 0.5.
         min_episodes (int): in each window. Defaults to 6.
         return_key, done_key (NestedKey): see :class:`~torchrl_priors.TeacherTrial`.
 
@@ -84,7 +84,7 @@ class LetGo:
         *,
         window: int,
         rest: str | None = None,
-        rate: float = 2.0,
+        rate: float = 0.5,
         min_episodes: int = 6,
         return_key: NestedKey = ("next", "episode_reward"),
         done_key: NestedKey = ("next", "done"),
