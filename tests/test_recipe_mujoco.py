@@ -19,7 +19,7 @@ from torch import nn
 from torchrl.modules import TanhNormal
 
 pytest.importorskip("mujoco")
-from recipes import mujoco_agent
+from recipes import mujoco, mujoco_agent
 from recipes.export_best import ExportConfig, export
 from torchrl_priors import ModulePrior
 from torchrl_priors.artifacts import save_prior
@@ -277,7 +277,7 @@ def test_a_sweep_runs_every_combination_although_one_is_broken(tmp_path, monkeyp
     monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as end:
-        recipe.main()
+        mujoco.main()
     assert end.value.code == 1
     said = capfd.readouterr()
     assert "Sweep: 2 of 4 runs are done, 2 failed." in said.out
