@@ -1,7 +1,7 @@
 """Teachers of unknown worth: a student alone and one with each of three bots, and what their returns say of the bots.
 
 The good bot balances the pole, the weak one for some forty steps, the bad one pushes it over. Frames of all students
-count. The winner goes on, and its teacher is let go as far as returns allow.
+count. The winner goes on, and its teacher is let go when returns do not rise any more.
 
     python examples/trial.py
 """
@@ -11,11 +11,11 @@ import argparse
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, GymWrapper, RewardSum, TransformedEnv
+from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import ActionPrior, ClipPPOPriorLoss, LetGo, PriorLogProb, TeacherTrial
+from torchrl_priors import ActionPrior, ClipPPOPriorLoss, Plateau, PriorLogProb, TeacherTrial
 from torchrl_priors.collectors import make_vector_env
 
 parser = argparse.ArgumentParser()
@@ -56,7 +56,7 @@ class Student:
     def __init__(self, push):
         torch.manual_seed(args.seed)
         env = GymWrapper(make_vector_env("CartPole-v1", num_envs=16), categorical_action_encoding=True)
-        env = TransformedEnv(env, Compose(RewardSum()))
+        env = TransformedEnv(env, RewardSum())
         env.set_seed(args.seed)
         actor = categorical_actor(MLP(in_features=4, out_features=2, num_cells=[64, 64]))
         critic = ValueOperator(MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation"])
@@ -65,8 +65,7 @@ class Student:
         self.advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
         self.optim = torch.optim.Adam(self.loss.parameters(), lr=1e-3)
         postproc = PriorLogProb.from_loss(self.loss)
-        self.collector = Collector(env, actor, frames_per_batch=2048, total_frames=-1, postproc=postproc)
-        self.batches = iter(self.collector)
+        self.batches = iter(Collector(env, actor, frames_per_batch=2048, total_frames=-1, postproc=postproc))
 
     def round(self):
         """Collect a batch and train on it; the batch."""
@@ -88,11 +87,12 @@ while trial.decide() is None:
 print(trial.result)
 
 winner, frames = students[trial.result.winner], sum(trial.frames.values())
-let_go = LetGo(winner.loss, "prior_loss.aux_coeff", window=4096)
+plateau = Plateau(window=4096)
 while frames < args.frames:
     batch = winner.round()
-    frames, factor = frames + batch.numel(), let_go.update(batch)
-    returns = batch["next", "episode_reward"][batch["next", "done"]]
-    print(f"{frames:6d} frames, return {returns.mean():5.0f}, the teacher's coefficient {factor:.2f}", flush=True)
-for student in students.values():
-    student.collector.shutdown()
+    frames += batch.numel()
+    plateau.update(batch)
+    if plateau.reached:
+        winner.loss.prior_loss.aux_coeff.zero_()
+    returns, coeff = batch["next", "episode_reward"][batch["next", "done"]], winner.loss.prior_loss.aux_coeff
+    print(f"{frames:6d} frames, return {returns.mean():5.0f}, teacher's coefficient {coeff:.0f}", flush=True)

@@ -44,17 +44,17 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         run.announce("compiling")
     start, first = time.perf_counter(), students.frames
     while students.frames < cfg.total_frames:
-        undecided = students.result is None
+        known = len(students.results)
         for arm, metrics, weights in students.round():
             metrics["fps"] = torch.tensor((students.frames - first) / (time.perf_counter() - start))
-            run.log(students.frames, metrics, weights, arm=arm if students.trial else None)
-        if undecided and students.result is not None:
-            run.log_trial(students.result)
-        if run.evaluation_is_due(students.frames):
-            evaluate_policy()
+            run.log(students.frames, metrics, weights, arm=arm if students.several else None)
+            if run.evaluation_is_due(students.frames):  # of trials, too, at the same frames as of any other run
+                evaluate_policy()
+        if len(students.results) > known:
+            run.log_trials(students.results)
         run.checkpoint_if_due(students.frames)
     agent = students.by_arm[students.chosen].agent
-    run.finish(agent.actor, agent.normalizer, env_id)
+    run.finish(agent.actor, agent.normalizer, env_id, arm=students.chosen if students.several else None)
 
 
 @hydra.main(version_base="1.3", config_path="../conf", config_name="mujoco")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -27,9 +28,9 @@ from torchrl_priors import (
 )
 from torchrl_priors.artifacts import load_prior
 from torchrl_priors.collectors import RunningNorm, VectorCollector, make_vector_env
-from torchrl_priors.let_go import LetGo
 from torchrl_priors.networks import make_actor, make_critic, make_prior_weight
 from torchrl_priors.objectives import CompiledStep
+from torchrl_priors.plateau import Plateau
 
 
 class AVECClipPPOLoss(AVECMixin, ClipPPOLoss):
@@ -70,6 +71,11 @@ def make_weight(cfg: MujocoConfig, obs_dim: int) -> TensorDictModuleBase:
         oracle = OracleWeight(cfg.prior.feature, cfg.prior.threshold)
         return TensorDictModule(oracle, in_keys=["observation"], out_keys=["prior_weight"])
     return make_prior_weight(obs_dim, list(cfg.ppo.hidden), init_bias=cfg.weight.init_bias)
+
+
+def lets_go(cfg: MujocoConfig) -> bool:
+    """Whether it is tried to let the student's teacher go."""
+    return cfg.method != "none" and cfg.let_go.methods == "all" and not applies(cfg.schedule, cfg.method)
 
 
 class Agent(nn.Module):
@@ -114,8 +120,7 @@ class Agent(nn.Module):
             )
             self.transforms.append(bonus)
             self.advantage.set_keys(reward="shaped_reward")
-        lets_go = cfg.let_go.methods == "all" and not applies(cfg.schedule, cfg.method)
-        self.shares_entropy = lets_go and spec.auxiliary and spec.cross_entropy == "student"
+        self.shares_entropy = lets_go(cfg) and spec.auxiliary and spec.cross_entropy == "student"
         if self.shares_entropy:
             options["kl_share"] = 0.0
         self.loss = AVECClipPPOPriorLoss(
@@ -220,38 +225,57 @@ class Student:
             normalizer=self.agent.normalizer,
             seed=cfg.seed,
         )
+        self.cfg, self.env_id = cfg, env_id
         self.coefficients = self.agent.coefficients()
+        self.full = {name: float(module.get_buffer(buffer)) for name, (module, buffer) in self.coefficients.items()}
         self.schedulers: dict[str, CoeffScheduler] = {}
-        self.let_go: dict[str, LetGo] = {}
         if applies(cfg.schedule, cfg.method):
             for name, (module, buffer) in self.coefficients.items():
-                schedule = make_schedule(cfg.schedule, cfg.total_frames, float(module.get_buffer(buffer)))
+                schedule = make_schedule(cfg.schedule, cfg.total_frames, self.full[name])
                 self.schedulers[name] = CoeffScheduler(module, buffer, schedule)
-        elif cfg.let_go.methods == "all":
-            for name, (module, buffer) in self.coefficients.items():
-                rest = "kl_share" if self.agent.shares_entropy and buffer == "aux_coeff" else None
-                self.let_go[name] = LetGo(module, buffer, rest=rest, window=cfg.let_go.window, rate=cfg.let_go.rate)
+        self.plateau = Plateau(window=cfg.let_go.window) if lets_go(cfg) else None
+        self.leaving: int | None = None
+        """Its frames when its teacher began to fade."""
         self.random = RandomState()
 
     def parts(self) -> dict[str, Any]:
         """What a checkpoint has of it, by name."""
         parts: dict[str, Any] = {"agent": self.agent, "optimizer": self.optimise.adam, "collector": self.collector}
-        return parts | {"random": self.random} | {f"let_go_{name}": let_go for name, let_go in self.let_go.items()}
+        parts["random"] = self.random
+        return parts if self.plateau is None else parts | {"plateau": self.plateau}
+
+    def twin(self) -> Student:
+        """Another student in the same state."""
+        twin = Student(self.cfg, self.env_id)
+        for name, part in self.parts().items():
+            twin.parts()[name].load_state_dict(deepcopy(part.state_dict()))
+        twin.leaving = self.leaving
+        return twin
+
+    def _set_coefficients(self) -> None:
+        for scheduler in self.schedulers.values():
+            scheduler.step(self.collector.frames)
+        if self.leaving is None:
+            return
+        factor = max(0.0, 1.0 - (self.collector.frames - self.leaving) / self.cfg.let_go.window)
+        for name, (module, buffer) in self.coefficients.items():
+            module.get_buffer(buffer).fill_(factor * self.full[name])
+        if self.agent.shares_entropy:  # the student's entropy, which the cross-entropy took
+            prior_loss: Any = self.agent.loss.prior_loss
+            prior_loss.kl_share.fill_(1.0)
 
     def round(self) -> tuple[TensorDictBase, dict[str, Tensor], Tensor | None]:
         """Collect a rollout and train on it; the rollout, the means of what was measured, and its states' weights."""
         self.random.restore()
-        for scheduler in self.schedulers.values():
-            scheduler.step(self.collector.frames)
+        self._set_coefficients()
         rollout = self.collector.rollout()
         metrics = self.optimise(self.agent.prepare(rollout))
         ended = rollout["next", "done"].squeeze(-1)
         metrics["episode_return"] = rollout["next", "episode_reward"].squeeze(-1)[ended].mean()
-        for name in self.schedulers.keys() | self.let_go.keys():
-            module, buffer = self.coefficients[name]
-            metrics[name] = module.get_buffer(buffer).clone()
-        for let_go in self.let_go.values():
-            let_go.update(rollout)
+        if self.schedulers or self.leaving is not None:
+            metrics |= {name: module.get_buffer(at).clone() for name, (module, at) in self.coefficients.items()}
+        if self.plateau is not None:
+            self.plateau.update(rollout)
         weights = None
         if (weight := self.agent.weight) is not None:
             weights = weight(rollout.select(*weight.in_keys))["prior_weight"].detach()

@@ -82,7 +82,6 @@ class LetGo:
 
     methods: str = MISSING
     window: int = MISSING
-    rate: float = MISSING
 
 
 @dataclass
@@ -149,7 +148,8 @@ ConfigStore.instance().store(group="schema", name="mujoco", node=MujocoConfig, p
 def teachers(cfg: MujocoConfig) -> list[Path]:
     """The teachers' files."""
     path = cfg.prior.path
-    return [] if path is None else [Path(path)] if isinstance(path, str) else [Path(str(one)) for one in path]
+    several = path if isinstance(path, Sequence) and not isinstance(path, str) else [path]
+    return [] if path is None else [Path(str(one)) for one in several]
 
 
 def method_of(cfg: MujocoConfig) -> MethodSpec:
@@ -178,10 +178,12 @@ def check(cfg: MujocoConfig) -> None:
     spec = method_of(cfg)
     files = teachers(cfg)
     if cfg.method == "trial":
-        _check_trial(cfg, files)
+        _check_arms(cfg, files)
     elif cfg.method != "none":
         expected = "the file of a teacher" if not files else "one teacher; method=trial takes several"
         _require(len(files) == 1, "prior.path", cfg.prior.path, f"{expected}, as method={cfg.method} has one")
+    if cfg.method == "trial" or cfg.let_go.methods == "all":
+        _check_trial(cfg)
     options = {
         "td_error": (cfg.td_error, ("original", "shaped")),
         "centering": (cfg.centering, ("none", "prior", "policy")),
@@ -208,7 +210,6 @@ def check(cfg: MujocoConfig) -> None:
         "ppo.max_grad_norm": cfg.ppo.max_grad_norm,
         "weight.epochs": cfg.weight.epochs,
         "let_go.window": cfg.let_go.window,
-        "let_go.rate": cfg.let_go.rate,
         "evaluation.interval": cfg.evaluation.interval,
         "evaluation.episodes": cfg.evaluation.episodes,
         "checkpoint.interval": cfg.checkpoint.interval,
@@ -273,26 +274,25 @@ def _check_env(cfg: MujocoConfig) -> tuple[int, int]:
         raise ValueError(f"env={name}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
 
-def _check_trial(cfg: MujocoConfig, files: Sequence[Path]) -> None:
-    trial, arms = cfg.trial, len(files) + 1
+def _check_arms(cfg: MujocoConfig, files: Sequence[Path]) -> None:
+    arms, method = len(files) + 1, cfg.trial.method
     _require(bool(files), "prior.path", cfg.prior.path, "the files of one or more teachers, as method=trial tries them")
     names = [file.stem for file in files]
     _require(len({*names, ALONE}) == arms, "prior.path", cfg.prior.path, f"files of different names, none {ALONE!r}")
-    _require(trial.method != "none", "trial.method", trial.method, "a method with a teacher")
+    _require(method != "none", "trial.method", method, "a method with a teacher")
     batch = cfg.env.frames_per_batch
-    _require(trial.max_frames >= batch, "trial.max_frames", trial.max_frames, f"at least one rollout of {batch}")
-    _require(
-        0 <= trial.min_frames <= trial.max_frames,
-        "trial.min_frames",
-        trial.min_frames,
-        f"a number from 0 to trial.max_frames={trial.max_frames}",
-    )
+    least = arms * (-(-cfg.trial.max_frames // batch)) * batch
+    frames, expected = cfg.total_frames, f"at least {least}, for a trial of {arms} students"
+    _require(frames >= least, "total_frames", frames, expected)
+
+
+def _check_trial(cfg: MujocoConfig) -> None:
+    trial, batch = cfg.trial, cfg.env.frames_per_batch
+    most = trial.max_frames
+    _require(most >= batch, "trial.max_frames", most, f"at least one rollout of {batch}")
+    _require(0 <= trial.min_frames <= most, "trial.min_frames", trial.min_frames, f"a number from 0 to {most}")
     _require(0 < trial.alpha < 1, "trial.alpha", trial.alpha, "a number between 0 and 1")
     _require(0 < trial.recent <= 1, "trial.recent", trial.recent, "a share above 0 and up to 1")
-    least = arms * (-(-trial.max_frames // batch)) * batch
-    _require(
-        cfg.total_frames >= least, "total_frames", cfg.total_frames, f"at least {least}, for a trial of {arms} students"
-    )
 
 
 def _check_prior(cfg: MujocoConfig, path: Path, obs_dim: int, act_dim: int) -> None:

@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,7 +51,7 @@ class Run:
     def __init__(self, cfg: MujocoConfig) -> None:
         plain: Any = OmegaConf.to_container(cfg, resolve=True)
         matters = {key: value for key, value in plain.items() if key not in _INCIDENTAL}
-        idle = [] if cfg.method == "trial" else ["trial"] if cfg.let_go.methods == "all" else ["trial", "let_go"]
+        idle = [] if cfg.method == "trial" or cfg.let_go.methods == "all" else ["trial", "let_go"]
         matters = {key: value for key, value in matters.items() if key not in idle}
         matters = without_idle(matters, cfg.schedule, [cfg.trial.method if cfg.method == "trial" else cfg.method])
         if files := teachers(cfg):
@@ -80,12 +80,13 @@ class Run:
     def register(self, students: Students) -> None:
         """Who learns; loads their last checkpoint if the run is to be resumed, removes all checkpoints if not."""
         self.frames = 0
-        self.checkpoint = Checkpoint(**students.parts())
+        self.students = students
         if not self.cfg.resume and self.rotation.directory.exists():
             shutil.rmtree(self.rotation.directory)
         if self.cfg.resume and (latest := self.rotation.latest()) is not None:
             refuse_foreign(latest)
-            self.rotation.load_latest(self.checkpoint)
+            self.rotation.load_latest(Checkpoint(stage=students), components=["stage"])
+            self.rotation.load_latest(Checkpoint(**students.parts()))
             self.frames = students.frames
             self.evaluations = _rows_until(self.folder.path / "eval.csv", self.frames)
             self.metrics = _rows_until(self.folder.path / "metrics.csv", self.frames)
@@ -130,11 +131,11 @@ class Run:
             if weights is not None:
                 self.logger.histogram(f"{prefix}/prior_weights", weights, frames)
 
-    def log_trial(self, result: TrialResult) -> None:
-        """Keep who won the trial, and say so."""
-        text = json.dumps(result._asdict(), indent=1)
-        self.folder.write("trial.json", lambda path: path.write_text(text))
-        tqdm.write(f"{self.folder.path}: {result}")
+    def log_trials(self, results: Sequence[TrialResult]) -> None:
+        """Keep who won the trials so far, and say who won the last."""
+        text = json.dumps([result._asdict() for result in results], indent=1)
+        self.folder.write("trials.json", lambda path: path.write_text(text))
+        tqdm.write(f"{self.folder.path}: {results[-1]}")
 
     def evaluation_is_due(self, frames: int) -> bool:
         """Whether the policy is to be evaluated now: every ``evaluation.interval`` frames and at the end."""
@@ -168,10 +169,10 @@ class Run:
         if frames >= self.next_checkpoint or frames >= self.cfg.total_frames:
             self.next_checkpoint = _next_multiple(frames, self.cfg.checkpoint.interval)
             self._write_tables()
-            self.rotation.save(self.checkpoint, step=frames)
+            self.rotation.save(Checkpoint(**self.students.parts()), step=frames)
             self.set_status("running", frames=frames)
 
-    def finish(self, actor: Any, normalizer: Any, env_id: str) -> None:
+    def finish(self, actor: Any, normalizer: Any, env_id: str, arm: str | None = None) -> None:
         """Export the policy as a teacher, and say that the run is done."""
         last = self.evaluations[-1]
         save_policy(
@@ -187,7 +188,8 @@ class Run:
         self.bar.close()
         if self.logger is not None:
             self.logger.close()
-        self.set_status("finished", frames=self.frames, mean_return=last["mean_return"])
+        whose = {} if arm is None else {"arm": arm}
+        self.set_status("finished", frames=self.frames, mean_return=last["mean_return"], **whose)
         print(f"{self.folder.path}: finished, return {last['mean_return']:.1f} at {self.frames} frames", flush=True)
 
     def _write_tables(self) -> None:

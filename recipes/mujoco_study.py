@@ -136,7 +136,7 @@ class Tables:
         columns = {"frames": "frames", "mean_return": "return", "std_return": "std", "episodes": "episodes"}
         metrics = pd.read_csv(run.folder / "metrics.csv", float_precision="round_trip")
         if "arm" in metrics:  # of a trial: those of the student who won it
-            metrics = metrics[metrics["arm"] == metrics["arm"].iloc[-1]]
+            metrics = metrics[metrics["arm"] == json.loads((run.folder / "status.json").read_text())["arm"]]
         kept = [name for name in TRAINING if name in metrics and metrics[name].notna().any()]
         new = {
             "": evaluations[list(columns)].rename(columns=columns),

@@ -14,6 +14,8 @@ from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 
 __all__ = ["Students", "arms"]
 
+LET_GO = ", let go"
+
 
 def arms(cfg: MujocoConfig) -> dict[str, MujocoConfig]:
     """The configuration of each student, by the name of its teacher; of a run without a trial, the only one."""
@@ -31,55 +33,99 @@ def arms(cfg: MujocoConfig) -> dict[str, MujocoConfig]:
 
 
 class Students:
-    """The students of a run, who take turns, and the trial between them if there is one."""
+    """The students of a run, who take turns, and the trial between them while there is one.
+
+    With ``method=trial`` the first trial is between the teachers. When the returns of a student with a teacher do not
+    rise any more, a second one finds out whether it is better off without: a twin, whose teacher fades, against the
+    student itself. If the teacher stays, the next such trial comes when the student has made twice as many frames.
+    """
 
     def __init__(self, cfg: MujocoConfig, env_id: str) -> None:
+        self.cfg = cfg
         self.by_arm = {arm: Student(arm_cfg, env_id) for arm, arm_cfg in arms(cfg).items()}
-        self.trial: TeacherTrial | None = None
-        if cfg.method == "trial":
-            options = cfg.trial
-            self.trial = TeacherTrial(
-                list(self.by_arm),
-                max_frames=options.max_frames,
-                min_frames=options.min_frames,
-                alpha=options.alpha,
-                recent=options.recent,
-            )
-
-    @property
-    def frames(self) -> int:
+        self.chosen = next(iter(self.by_arm))
+        """Whose policy is the run's: the last winner's; before there is one, that of the student alone."""
+        self.trial = self._trial(list(self.by_arm)) if len(self.by_arm) > 1 else None
+        self.results: list[TrialResult] = []
+        self.frames = 0
         """Of all students together."""
-        return sum(student.collector.frames for student in self.by_arm.values())
+        self._patience = 0
 
-    @property
-    def result(self) -> TrialResult | None:
-        """Of the trial."""
-        return None if self.trial is None else self.trial.result
-
-    @property
-    def chosen(self) -> str:
-        """Whose policy is the run's: the winner's; before there is one, that of the student alone."""
-        return next(iter(self.by_arm)) if self.result is None else self.result.winner
-
-    def parts(self) -> dict[str, Any]:
-        """What a checkpoint consists of, by name."""
-        several: dict[str, Any] = {} if self.trial is None else {"trial": self.trial}
-        for number, student in enumerate(self.by_arm.values()):
-            suffix = "" if self.trial is None else f"_{number}"
-            several |= {f"{name}{suffix}": part for name, part in student.parts().items()}
-        return several
+    def _trial(self, arms: list[str]) -> TeacherTrial:
+        """In doubt without a teacher: gains that are to come come without it."""
+        (alone,) = (arm for arm in arms if arm == ALONE or arm.endswith(LET_GO))
+        trial = self.cfg.trial
+        options: dict[str, Any] = {"alpha": trial.alpha, "recent": trial.recent, "min_frames": trial.min_frames}
+        return TeacherTrial(arms, max_frames=trial.max_frames, alone=alone, **options)
 
     def round(self) -> Iterator[tuple[str, dict[str, Tensor], Tensor | None]]:
         """Train each student that is still in on one rollout; its name, what was measured, and the prior weights.
 
-        The trial is decided after the last of them, if it can be.
+        After the last of them a trial may end or begin.
         """
-        if self.trial is None or self.trial.result is not None:
-            _, metrics, weights = self.by_arm[self.chosen].round()
-            yield self.chosen, metrics, weights
-            return
-        for arm in list(self.trial.active):
+        for arm in [self.chosen] if self.trial is None else list(self.trial.active):
+            if self.frames >= self.cfg.total_frames:  # in the middle of a trial
+                return
             rollout, metrics, weights = self.by_arm[arm].round()
-            self.trial.update(arm, rollout)
+            self.frames += rollout.numel()
+            if self.trial is not None:
+                self.trial.update(arm, rollout)
             yield arm, metrics, weights
-        self.trial.decide()
+        if self.trial is not None:
+            if (result := self.trial.decide()) is not None:
+                self.results.append(result)
+                self.chosen, self.trial = result.winner, None
+        elif self._may_let_go():
+            student = self.by_arm[self.chosen]
+            twin = student.twin()
+            twin.leaving = student.collector.frames
+            self._patience = 2 * student.collector.frames
+            self.by_arm[self.chosen + LET_GO] = twin
+            self.trial = self._trial([self.chosen, self.chosen + LET_GO])
+
+    def _may_let_go(self) -> bool:
+        """Whether the student's returns stand still, it is time to look, and a trial can still be decided."""
+        student = self.by_arm[self.chosen]
+        if student.plateau is None or student.leaving is not None or student.collector.frames < self._patience:
+            return False
+        enough = self.frames + 2 * self.cfg.trial.min_frames <= self.cfg.total_frames
+        return enough and student.plateau.reached
+
+    @property
+    def several(self) -> bool:
+        """Whether there is, or may be, more than one."""
+        return len(self.by_arm) > 1 or any(student.plateau is not None for student in self.by_arm.values())
+
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint consists of, by name; ``stage`` is to be loaded first, for it says who there is."""
+        found: dict[str, Any] = {"stage": self}
+        for number, student in enumerate(self.by_arm.values()):
+            suffix = f"_{number}" if number else ""
+            found |= {f"{name}{suffix}": part for name, part in student.parts().items()}
+        return found
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the run is, as plain values; the students are parts of their own."""
+        return {
+            "chosen": self.chosen,
+            "frames": self.frames,
+            "patience": self._patience,
+            "leaving": {arm: student.leaving for arm, student in self.by_arm.items()},
+            "results": [result._asdict() for result in self.results],
+            "trial": None if self.trial is None else self.trial.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue where a run was."""
+        self.chosen, self.frames = state_dict["chosen"], int(state_dict["frames"])
+        self.results = [TrialResult(**result) for result in state_dict["results"]]
+        for arm, leaving in state_dict["leaving"].items():
+            if arm not in self.by_arm:
+                kept = self.by_arm[arm.removesuffix(LET_GO)]
+                self.by_arm[arm] = Student(kept.cfg, kept.env_id)
+            self.by_arm[arm].leaving = leaving
+        self._patience = int(state_dict["patience"])
+        self.trial = None
+        if (trial := state_dict["trial"]) is not None:
+            self.trial = self._trial([arm for arm in self.by_arm if arm in trial["returns"]])
+            self.trial.load_state_dict(trial)

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from recipes.report_runs import spec_of
 from recipes.report_tables import ALL, Study
-from torchrl_priors.methods import get_method
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots.benchmark import interval_panels, profile_panels, return_curves
 
@@ -135,7 +135,9 @@ def _prior_weights(study: Study) -> Figure | None:
     for env, prior in study.panels():
         for label in study.methods(env, prior):
             runs = study.runs(env, prior, label)
-            if get_method(runs[0].method).adaptive and all(set(names) <= set(run.metrics) for run in runs):
+            if spec_of(runs[0].method, runs[0].settings).adaptive and all(
+                set(names) <= set(run.metrics) for run in runs
+            ):
                 mean = pd.concat([run.metrics[["frames", *names]] for run in runs]).groupby("frames").mean()
                 title = _title(study, env, prior)
                 panels.setdefault(title, {})[label] = ConfidenceInterval(*mean[names].to_numpy().T)

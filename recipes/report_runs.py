@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import glob
@@ -16,7 +16,7 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from recipes.report_config import ReportConfig
-from torchrl_priors.methods import METHODS, get_method
+from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
 __all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "short_paths", "without_misfits"]
 
@@ -104,12 +104,12 @@ def _read(folder: Path) -> Run | LeftOut:
 
 
 def _read_whole(folder: Path) -> Run:
-    _check_finished(folder)
+    arm = _check_finished(folder).get("arm")
     try:
         # as it is: what another's file has in ${...} could be a secret of this machine, and the report is published
         config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
         method, seed, env = str(config["method"]), int(config["seed"]), _env(config["env"])
-        auxiliary = get_method(method).auxiliary
+        auxiliary = spec_of(method, config).auxiliary and method != "trial"  # whose winner may have no teacher
     except FileNotFoundError:
         raise _UnusableError("config.yaml is missing") from None
     except Exception as error:  # whatever reading a damaged file ends in
@@ -123,11 +123,12 @@ def _read_whole(folder: Path) -> Run:
         seed=seed,
         settings=_flatten(config),
         evaluations=_table(folder / "eval.csv", ["frames", "mean_return"], optional=()),
-        metrics=_table(folder / "metrics.csv", needed, optional=("episode*",)),
+        metrics=_table(folder / "metrics.csv", needed, optional=("episode*", "aux_coeff", "bonus_coeff"), arm=arm),
     )
 
 
-def _check_finished(folder: Path) -> None:
+def _check_finished(folder: Path) -> dict[str, Any]:
+    """What the run says of itself."""
     try:
         status = json.loads((folder / "status.json").read_text())
         state = status["state"]
@@ -139,9 +140,10 @@ def _check_finished(folder: Path) -> None:
         raise _UnusableError(f"it failed: {status.get('error') or 'no reason given'}")
     if state != "finished":
         raise _UnusableError(f"it is not finished (state {state}, {status.get('frames', 'unknown')} frames)")
+    return dict(status)
 
 
-def _table(file: Path, needed: Sequence[str], optional: Sequence[str]) -> pd.DataFrame:
+def _table(file: Path, needed: Sequence[str], optional: Sequence[str], arm: str | None = None) -> pd.DataFrame:
     """A CSV whose needed columns are there, and without a hole in any column that isn't off (empty) as a whole."""
     try:
         table = pd.read_csv(file)
@@ -153,6 +155,8 @@ def _table(file: Path, needed: Sequence[str], optional: Sequence[str]) -> pd.Dat
         raise _UnusableError(f"{file.name} has no column {', '.join(absent)}")
     if table.empty:
         raise _UnusableError(f"{file.name} has no rows")
+    if "arm" in table:  # of a trial: the rows of the student who won it
+        table = table[table["arm"] == arm].drop(columns="arm").reset_index(drop=True)
     for name in table.columns:
         values = pd.to_numeric(table[name], errors="coerce")
         bad = ~np.isfinite(values.to_numpy(dtype=np.float64))
@@ -174,6 +178,12 @@ def _env(node: Any) -> str:
     name = name if version is None or name.endswith(f"-{version}") else f"{name}-{version}"
     changed = ", ".join(f"{key}={_short(value)}" for key, value in (node.get("kwargs") or {}).items())
     return f"{name} ({changed})" if changed else name
+
+
+def spec_of(method: str, settings: Mapping[str, Any]) -> MethodSpec:
+    """The settings of a run's method, or of that which its trial tries."""
+    tried = settings.get("trial.method") or (settings.get("trial") or {}).get("method", "")
+    return get_method(str(tried) if method == "trial" else method)
 
 
 def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -240,7 +250,8 @@ def _prior_settings(run: Run) -> dict[str, Any]:
 
 def _method_settings(run: Run, cfg: ReportConfig) -> dict[str, Any]:
     patterns = list(cfg.same)
-    spec = get_method(run.method)
+    spec = spec_of(run.method, run.settings)
+    patterns += [] if run.method == "trial" or run.settings.get("let_go.methods") == "all" else ["trial.*", "let_go.*"]
     patterns += cfg.with_prior if run.method == "none" else []
     patterns += cfg.with_bonus if spec.bonus == "none" else []
     patterns += [] if spec.adaptive else cfg.with_weight
@@ -284,7 +295,7 @@ def without_misfits(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
             left_out.append(LeftOut(run.path, f"it repeats {kept[key].path} (same method, prior and seed)"))
         else:
             kept[key] = run
-    order = list(METHODS)
+    order = [*METHODS, "trial"]
     usable = sorted(
         kept.values(), key=lambda run: (run.env, run.degraded, run.prior, order.index(run.method), run.label, run.seed)
     )

@@ -118,7 +118,7 @@ class Study:
 
 
 def _method_order(run: Run) -> tuple[int, str]:
-    return list(METHODS).index(run.method), run.label
+    return [*METHODS, "trial"].index(run.method), run.label
 
 
 def of(prior: str) -> str:

@@ -36,7 +36,7 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
             environment or the checkpoint could run code.
     """
     cfg: Any = OmegaConf.load(folder / "config.yaml")
-    if not get_method(cfg.method).adaptive:
+    if cfg.method == "trial" or not get_method(cfg.method).adaptive:
         raise ValueError(f"{folder} is a run of method={cfg.method}, which has no learned weight.")
     if teacher is not None:
         cfg.prior.path = teacher

@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
-from mujoco_cases import interrupt, run
+from hydra import compose, initialize_config_dir
+from mujoco_cases import ROOT, interrupt, run
 
-from torchrl_priors import TeacherTrial
+from recipes.report_runs import find, name_groups, read, without_misfits
+from recipes.show_episode import load_agent
+from torchrl_priors import Plateau, TeacherTrial
 
-SHORT = ["trial.max_frames=128", "trial.min_frames=64", "let_go.window=64"]
+SHORT = ["trial.max_frames=128", "trial.min_frames=64"]
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +36,14 @@ def trial(teachers) -> list[str]:
     return ["method=trial", f"prior.path={teachers / 'first.safetensors'}", *SHORT]
 
 
+def compose_report(runs: Path) -> Any:
+    """The configuration of a report."""
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("report", overrides=[f"runs={runs}"])
+
+
 def winner(out: Path) -> str:
-    return json.loads((out / "trial.json").read_text())["winner"]
+    return json.loads((out / "trials.json").read_text())[-1]["winner"]
 
 
 def always(monkeypatch: pytest.MonkeyPatch, arm: str) -> None:
@@ -54,7 +64,7 @@ def test_frames_of_all_students_count_and_each_is_logged(trial, teachers, tmp_pa
     assert metrics["frames"].tolist() == list(range(64, 513, 64))
     assert metrics["arm"].tolist() == [*["alone", "first", "second"] * 2, *[winner(out)] * 2]
     assert pd.read_csv(out / "eval.csv")["frames"].iloc[-1] == 512
-    result = json.loads((out / "trial.json").read_text())
+    (result,) = json.loads((out / "trials.json").read_text())
     assert result["frames"] == {"alone": 128, "first": 128, "second": 128}
 
 
@@ -80,18 +90,82 @@ def test_a_trial_that_was_interrupted_gives_the_same_files(stop, trial, tmp_path
     whole = run(tmp_path / "whole", *options)
     interrupt(monkeypatch, tmp_path / "stopped", stop, *options)
     run(tmp_path / "stopped", *options)
-    for name in ("eval.csv", "policy.safetensors", "trial.json"):
+    for name in ("eval.csv", "policy.safetensors", "trials.json"):
         assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
 
 
-def test_a_teacher_is_let_go_where_returns_do_not_rise(teachers, tmp_path):
+@pytest.fixture
+def standing_still(teachers) -> list[str]:
+    """A student whose returns do not rise, after 256 frames in a trial with its twin."""
     teacher = f"prior.path={teachers / 'first.safetensors'}"
-    small = ["let_go.methods=all", "let_go.window=256", "total_frames=1024", "ppo.lr=1e-9"]
-    rows = pd.read_csv(run(tmp_path / "let_go", "method=kickstart", teacher, *small) / "metrics.csv")
-    assert rows["aux_coeff"].iloc[0] == 1
-    assert rows["aux_coeff"].iloc[-1] < 1
-    kept = run(tmp_path / "kept", "method=kickstart", teacher, "total_frames=64")
-    assert "aux_coeff" not in pd.read_csv(kept / "metrics.csv")
+    return ["method=kickstart", teacher, *SHORT, "let_go.methods=all", "let_go.window=128", "ppo.lr=1e-9"]
+
+
+def test_a_student_that_stands_still_is_tried_without_its_teacher(standing_still, tmp_path, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self._returns.frames >= 256))
+    out = run(tmp_path, *standing_still, "total_frames=640")
+    rows = pd.read_csv(out / "metrics.csv")
+    kept, twin = "kickstart", "kickstart, let go"
+    assert rows["arm"].tolist() == [*[kept] * 4, *[kept, twin] * 2, *[twin] * 2]  # in doubt without the teacher
+    assert winner(out) == twin
+    both = rows.iloc[4:6]
+    assert both["episode_return"].nunique(dropna=False) == 1  # the twin begins in the very state of the student
+    assert rows.loc[rows["arm"] == twin, "aux_coeff"].tolist() == [1.0, 0.5, 0.0, 0.0]  # its teacher fades in a window
+    assert rows["frames"].tolist() == list(range(64, 641, 64))
+
+
+def test_a_teacher_that_stays_is_tried_again_after_twice_the_frames(standing_still, tmp_path, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self._returns.frames >= 128))
+    always(monkeypatch, "kickstart")
+    out = run(tmp_path, *standing_still, "total_frames=768")
+    rows = pd.read_csv(out / "metrics.csv")
+    kept, twin = "kickstart", "kickstart, let go"
+    # after 2 rollouts a trial of 2; after one more, more than 4 of its own, another one
+    assert rows["arm"].tolist() == [*[kept] * 2, *[kept, twin] * 2, kept, *[kept, twin] * 2, kept]
+    assert [result["winner"] for result in json.loads((out / "trials.json").read_text())] == [kept, kept]
+
+
+@pytest.mark.parametrize("stop", [256, 384, 576])  # before, in and after the trial with the twin
+def test_an_interrupted_run_with_a_twin_gives_the_same_files(stop, standing_still, tmp_path, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self._returns.frames >= 256))
+    options = [*standing_still, "ppo.lr=1e-3", "total_frames=640"]
+    whole = run(tmp_path / "whole", *options)
+    interrupt(monkeypatch, tmp_path / "stopped", stop, *options)
+    run(tmp_path / "stopped", *options)
+    for name in ("eval.csv", "policy.safetensors", "trials.json"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_no_trial_begins_that_could_not_be_decided(standing_still, tmp_path, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", True)
+    out = run(tmp_path, *standing_still, "total_frames=192", "trial.min_frames=128")
+    assert set(pd.read_csv(out / "metrics.csv")["arm"]) == {"kickstart"}
+
+
+def test_without_it_a_run_has_no_arms(standing_still, tmp_path):
+    out = run(tmp_path, *standing_still, "let_go.methods=trial", "total_frames=64")
+    assert "arm" not in pd.read_csv(out / "metrics.csv")
+
+
+def test_a_report_takes_a_trial_as_the_student_who_won_it(trial, tmp_path):
+    run(tmp_path / "trial", *trial)
+    run(tmp_path / "none")
+    runs, left_out = read(find(str(tmp_path)))
+    cfg: Any = compose_report(tmp_path)
+    name_groups(runs, cfg)
+    assert not left_out
+    assert sorted(run.label for run in runs) == ["none", "trial"]
+    taken = next(run for run in runs if run.method == "trial")
+    assert taken.metrics["frames"].tolist() == [64, 192]  # alone, in doubt
+    usable, misfits = without_misfits(runs)
+    assert [run.label for run in usable] == ["none", "trial"]
+    assert not misfits
+
+
+def test_a_trial_is_no_run_with_a_weight_to_show(trial, tmp_path):
+    out = run(tmp_path, *trial)
+    with pytest.raises(ValueError, match="no learned weight"):
+        load_agent(out, None)
 
 
 @pytest.mark.parametrize(

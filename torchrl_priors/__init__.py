@@ -4,7 +4,6 @@ from torchrl_priors.artifacts import load_prior, load_sb3_prior, save_prior
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
 from torchrl_priors.hooks import PriorShaping
-from torchrl_priors.let_go import LetGo
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 from torchrl_priors.metrics import (
     area_ratio,
@@ -23,6 +22,7 @@ from torchrl_priors.objectives import (
     ValueOffset,
     cross_entropy,
 )
+from torchrl_priors.plateau import Plateau
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import (
     ActionPrior,
@@ -50,13 +50,13 @@ __all__ = [
     "CosineSchedule",
     "GridWorldEnv",
     "GridWorlds",
-    "LetGo",
     "LinearSchedule",
     "MethodSpec",
     "MixturePrior",
     "ModulePrior",
     "MultiTeacherLoss",
     "PiecewiseSchedule",
+    "Plateau",
     "PriorBonus",
     "PriorLogProb",
     "PriorShaping",

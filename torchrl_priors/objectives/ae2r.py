@@ -86,8 +86,8 @@ class AE2RLoss(LossModule):
             ``"pull"`` and 1.0 of the others.
         kl_share (float, optional): how much of the student's entropy is given back, :math:`\eta` in
             :math:`H^X(\pi\|\pi_0)-\eta H(\pi)`: from 0, the cross-entropy, to 1, the divergence
-            :math:`\mathrm{KL}(\pi\|\pi_0)`. A buffer, as the coefficients are, for :class:`~torchrl_priors.LetGo`;
-            not for the methods that average over the teacher's actions. Defaults to ``None``: there is no such term.
+            :math:`\mathrm{KL}(\pi\|\pi_0)`. A buffer, as the coefficients are; not for methods that average over the
+            teacher's actions. Defaults to ``None``: there is no such term.
         weight_coeff (float): coefficient of ``loss_prior_weight``. Defaults to 1.0.
         critic_coeff (float): coefficient of ``loss_prior_critic``. Defaults to 1.0.
         gamma (float): discount. Defaults to 0.99.

@@ -1,0 +1,127 @@
+"""Studies of the MuJoCo recipe: what is missing is run, what is finished is in the tables, nothing stops the rest."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+pytest.importorskip("mujoco")
+from hydra import compose, initialize_config_dir
+from mujoco_cases import ROOT, TINY
+from omegaconf import OmegaConf
+
+from recipes.mujoco_study import KEY, Tables, expand, study
+
+
+def config(tmp_path: Path, runs: list, **changes: Any) -> Any:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = compose("mujoco_study", overrides=["study_mujoco=trial"])
+    cfg.set = dict(option.split("=") for option in TINY)
+    cfg.out, cfg.work, cfg.name, cfg.runs = str(tmp_path / "tables"), str(tmp_path / "work"), "tiny", runs
+    for name, value in changes.items():
+        cfg[name] = value
+    return cfg
+
+
+ONE = {"environments": ["hopper"], "methods": {"none": None}, "seeds": [0]}
+
+
+@pytest.mark.parametrize("name", [path.stem for path in (ROOT / "conf/study_mujoco").glob("*.yaml")])
+def test_every_study_names_runs_that_differ(name):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        runs = expand(compose("mujoco_study", overrides=[f"study_mujoco={name}"]))
+    assert len({run.folder for run in runs}) == len({run.key for run in runs}) == len(runs) > 10
+
+
+def test_blocks_stand_for_their_product_seed_by_seed(tmp_path):
+    block = {"environments": ["hopper", "ant"], "methods": {"e2r": None, "ae2r slow": {"weight.lr_coeff": 0.1}}}
+    runs = expand(config(tmp_path, [block | {"teachers": ["good", "bad"], "seeds": {"first": 3, "number": 2}}, ONE]))
+    assert [run.key for run in runs[:4]] == [
+        ("hopper", "good", "e2r", 3),
+        ("hopper", "bad", "e2r", 3),
+        ("hopper", "good", "ae2r slow", 3),
+        ("hopper", "bad", "ae2r slow", 3),
+    ]
+    assert len(runs) == 2 * 2 * 2 * 2 + 1
+    slow = runs[3].overrides
+    assert {"env=hopper", "seed=3", "method=ae2r", "weight.lr_coeff=0.1", "prior.degrade=structural"} <= set(slow)
+    assert "prior.path=results/mujoco/teachers/hopper.safetensors" in slow
+
+
+def test_what_is_missing_is_run_and_what_failed_stops_nothing(tmp_path, capsys):
+    broken = {"environments": ["hopper"], "methods": {"none": {"ppo.lr": -1}}, "seeds": [7]}
+    cfg = config(tmp_path, [broken, ONE])
+    with pytest.raises(ValueError, match=r"1 of 2 runs failed:\nhopper none none seed 7: .*ppo\.lr=-1") as error:
+        study(cfg)
+    assert "log.txt" in str(error.value)
+    tables = {kind: pd.read_csv(tmp_path / f"tables/tiny{kind}.csv") for kind in ("", "_training")}
+    assert tables[""]["frames"].tolist() == [0, 64, 128, 192, 256]
+    assert set(tables["_training"]["metric"]) == {"loss_objective", "entropy"}
+    before = (tmp_path / "tables/tiny.csv").read_bytes()
+    (tmp_path / "work").rename(tmp_path / "gone")  # another machine
+    capsys.readouterr()
+    study(config(tmp_path, [ONE]))
+    assert capsys.readouterr().out == "hopper: 1 of 1 runs are in the tables\n"
+    assert (tmp_path / "tables/tiny.csv").read_bytes() == before
+    assert not (tmp_path / "work").exists()
+
+
+def test_a_finished_run_that_is_not_in_the_tables_is_taken_in(tmp_path):
+    study(config(tmp_path, [ONE]))
+    whole = (tmp_path / "tables/tiny.csv").read_bytes()
+    (tmp_path / "tables/tiny.csv").unlink()
+    study(config(tmp_path, [ONE], run=False))
+    assert (tmp_path / "tables/tiny.csv").read_bytes() == whole
+
+
+def test_rows_are_in_one_order_whichever_run_ends_first(tmp_path):
+    runs = expand(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
+    study(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
+    forth, back = (Tables(tmp_path / name, "t") for name in ("forth", "back"))
+    for tables, order in ((forth, runs), (back, runs[::-1])):
+        for run in order:
+            tables.add(run)
+    assert forth.files[""].read_bytes() == back.files[""].read_bytes()
+    assert pd.read_csv(forth.files[""])[KEY].drop_duplicates()["seed"].tolist() == [0, 1]
+
+
+def test_a_killed_run_stops_no_other_and_is_continued(tmp_path):
+    options = {"set": dict(option.split("=") for option in TINY) | {"total_frames": "2560"}}
+    cfg = config(tmp_path, [ONE | {"seeds": [0, 1]}], **options)
+    (tmp_path / "study.yaml").write_text(OmegaConf.to_yaml(cfg))
+    script = f"from recipes.mujoco_study import *; study(OmegaConf.load({str(tmp_path / 'study.yaml')!r}))"
+    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+    child = None
+    while child is None and process.poll() is None:
+        command = ["pgrep", "-f", f"recipes.mujoco .*seed=0 .*{tmp_path}"]
+        found = subprocess.run(command, capture_output=True, text=True).stdout.split()
+        child = int(found[0]) if found else None
+        time.sleep(0.05)
+    assert child is not None
+    os.kill(child, signal.SIGKILL)
+    error = process.communicate()[1]
+    assert "1 of 2 runs failed" in error
+    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].nunique() == 1
+    study(cfg)
+    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].nunique() == 2
+
+
+@pytest.mark.parametrize(
+    ("runs", "message"),
+    [
+        ([{"environments": ["hopper"], "seeds": [0]}], r"runs\[0\]=.*expected .*methods"),
+        ([ONE | {"method": "e2r"}], r"runs\[0\]"),
+        ([ONE | {"teachers": ["best"]}], "teachers=best: expected one of good, weak, bad"),
+    ],
+)
+def test_bad_studies_are_refused_by_name(runs, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        study(config(tmp_path, runs))
