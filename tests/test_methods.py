@@ -37,7 +37,7 @@ def test_a_method_is_its_row_of_the_table(
 
 def test_there_is_no_method_outside_the_table() -> None:
     papers_and_ours = {"none", "er", "e2r", "aer", "ae2r", "kickstart", "aligned"}
-    assert set(METHODS) == papers_and_ours | {"annealed_kickstart", "kl_penalty"}
+    assert set(METHODS) == papers_and_ours | {"annealed_kickstart", "kl_penalty", "pull"}
 
 
 @pytest.mark.parametrize(("fixed", "adaptive"), [("er", "aer"), ("e2r", "ae2r")])
@@ -45,8 +45,13 @@ def test_the_adaptive_methods_differ_by_the_weight_alone(fixed: str, adaptive: s
     assert replace(get_method(fixed), adaptive=True) == get_method(adaptive)
 
 
-def test_aligned_is_kickstart_with_a_weight_learned_from_the_advantage() -> None:
-    assert replace(get_method("kickstart"), adaptive=True, weight_target="advantage") == get_method("aligned")
+def test_aligned_is_a_pull_with_a_weight_learned_from_the_advantage() -> None:
+    pull = replace(get_method("pull"), aux_coeff=1.0)
+    assert replace(pull, adaptive=True, weight_target="advantage") == get_method("aligned")
+
+
+def test_a_pull_is_a_constant_small_kickstart_that_averages_over_the_teachers_actions() -> None:
+    assert replace(get_method("kickstart"), cross_entropy="teacher", aux_coeff=0.3) == get_method("pull")
 
 
 def test_the_fields_baselines_are_relatives_of_kickstart_and_er() -> None:

@@ -18,7 +18,11 @@ from hydra import compose, initialize_config_dir
 from mujoco_cases import ROOT, TINY
 from omegaconf import OmegaConf
 
-from recipes.mujoco_study import KEY, Tables, expand, study
+from recipes import mujoco_study
+from recipes.mujoco import train
+from recipes.mujoco_config import check
+from recipes.mujoco_run import supervise
+from recipes.mujoco_study import KEY, StudyRun, Tables, expand, study
 
 
 def config(tmp_path: Path, runs: list, **changes: Any) -> Any:
@@ -29,6 +33,31 @@ def config(tmp_path: Path, runs: list, **changes: Any) -> Any:
     for name, value in changes.items():
         cfg[name] = value
     return cfg
+
+
+class Here:
+    """A run in this process, in the place of one of its own."""
+
+    def __init__(self, run: StudyRun) -> None:
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            cfg = compose("mujoco", overrides=[*run.overrides, f"out={run.folder}"])
+        self.returncode = 0
+        try:
+            supervise(cfg, check, train)
+        except SystemExit as error:
+            run.folder.mkdir(parents=True)
+            (run.folder / "log.txt").write_text(str(error))
+            self.returncode = 1
+
+    def poll(self) -> int:
+        """It has ended already."""
+        return self.returncode
+
+
+@pytest.fixture
+def here(monkeypatch) -> None:
+    """No processes: only their number would differ."""
+    monkeypatch.setattr(mujoco_study, "_start", Here)
 
 
 ONE = {"environments": ["hopper"], "methods": {"none": None}, "seeds": [0]}
@@ -56,6 +85,7 @@ def test_blocks_stand_for_their_product_seed_by_seed(tmp_path):
     assert "prior.path=results/mujoco/teachers/hopper.safetensors" in slow
 
 
+@pytest.mark.usefixtures("here")
 def test_what_is_missing_is_run_and_what_failed_stops_nothing(tmp_path, capsys):
     broken = {"environments": ["hopper"], "methods": {"none": {"ppo.lr": -1}}, "seeds": [7]}
     cfg = config(tmp_path, [broken, ONE])
@@ -74,6 +104,7 @@ def test_what_is_missing_is_run_and_what_failed_stops_nothing(tmp_path, capsys):
     assert not (tmp_path / "work").exists()
 
 
+@pytest.mark.usefixtures("here")
 def test_a_finished_run_that_is_not_in_the_tables_is_taken_in(tmp_path):
     study(config(tmp_path, [ONE]))
     whole = (tmp_path / "tables/tiny.csv").read_bytes()
@@ -82,6 +113,7 @@ def test_a_finished_run_that_is_not_in_the_tables_is_taken_in(tmp_path):
     assert (tmp_path / "tables/tiny.csv").read_bytes() == whole
 
 
+@pytest.mark.usefixtures("here")
 def test_rows_are_in_one_order_whichever_run_ends_first(tmp_path):
     runs = expand(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
     study(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
