@@ -2,8 +2,8 @@
 
     python -m recipes.report runs=<folder, glob or list> [out=<folder>] [key=value ...]
 
-Runs are those of ``recipes.mujoco`` or studies of ``recipes.gridworld``. A run or study that isn't finished, or whose
-data have holes, is named and in no table. See ``conf/report.yaml`` for the keys.
+Runs are those of ``recipes.mujoco``, the table of a study of them, or studies of ``recipes.gridworld``. A run or study
+that isn't finished, or whose data have holes, is named and in no table. See ``conf/report.yaml`` for the keys.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from recipes.report_config import ReportConfig, check
 from recipes.report_figures import TRAINING, curve_table, figures
 from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
 from recipes.report_runs import LeftOut, Run, find, is_gridworld, name_groups, read, short_paths, without_misfits
+from recipes.report_study import is_study, read_study
 from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.plots import save_figure
 
@@ -70,8 +71,11 @@ def report(cfg: ReportConfig) -> Path:
 
 
 def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
-    found, left_out = read(folders)
+    found, left_out = read([folder for folder in folders if not is_study(folder)])
     name_groups(found, cfg)
+    for path in filter(is_study, folders):
+        runs, unknown = read_study(path)
+        found, left_out = found + runs, left_out + unknown
     usable, misfits = without_misfits(found)
     return usable, left_out + misfits
 

@@ -157,8 +157,8 @@ def _training(study: Study, metric: str, name: str, differs: bool) -> Figure | N
         base = _by_frames(study, env, prior, study.cfg.baseline, metric)
         for label in study.methods(env, prior):
             curves = _by_frames(study, env, prior, label, metric)
-            if curves is None or (differs and label == study.cfg.baseline):
-                continue
+            if curves is None or len(curves) < 2 or (differs and label == study.cfg.baseline):
+                continue  # a study's table has the mean over training only
             if differs:
                 if base is None:
                     continue

@@ -68,12 +68,16 @@ def find(runs: Any) -> list[Path]:
     for pattern in patterns:
         below = [path for name in sorted(glob(str(pattern), recursive=True)) for path in _below(Path(name))]
         if not below:
-            raise ValueError(f"runs={pattern}: no folder with a config.yaml or a status.json is there.")
+            raise ValueError(
+                f"runs={pattern}: no folder with a config.yaml or a status.json, and no study's CSV, is there."
+            )
         found += below
     return list(dict.fromkeys(found))
 
 
 def _below(folder: Path) -> list[Path]:
+    if folder.suffix == ".csv" and folder.is_file():  # of a study
+        return [folder]
     files = [folder / name for name in ("config.yaml", "status.json")] if folder.is_dir() else []
     if any(file.exists() for file in files):
         return [folder]

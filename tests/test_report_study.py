@@ -1,0 +1,88 @@
+"""A report from the tables of a study: the same numbers as from the runs, without their folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+pytest.importorskip("hydra")
+from hydra import compose, initialize_config_dir
+
+from recipes.report import report
+
+ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
+
+def config(runs: Path, out: Path) -> Any:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return compose("report", overrides=[f"runs={runs}", f"out={out}", "bootstrap.reps=20"])
+
+
+@pytest.fixture
+def tables(tmp_path) -> Path:
+    """Two environments, a good teacher, three seeds; the return of a method is easy to see."""
+    rows, means = [], []
+    for env in ("hopper", "ant"):
+        for teacher, method, level in (("none", "none", 100.0), ("good", "e2r", 300.0), ("good", "ae2r slow", 200.0)):
+            for seed in range(3):
+                key = (env, teacher, method, seed)
+                rows += [(*key, frames, level * frames / 2 + seed) for frames in (0, 1, 2)]
+                means += [(*key, "entropy", level), (*key, "loss_objective", -level)]
+    names = ["env", "teacher", "method", "seed"]
+    path = tmp_path / "deep.csv"
+    pd.DataFrame(rows, columns=[*names, "frames", "return"]).to_csv(path, index=False)
+    pd.DataFrame(means, columns=[*names, "metric", "mean"]).to_csv(tmp_path / "deep_training.csv", index=False)
+    return path
+
+
+def test_returns_and_differences_come_from_the_tables(tables, tmp_path):
+    report(config(tables, tmp_path / "out"))
+    returns = pd.read_csv(tmp_path / "out/returns.csv", keep_default_na=False).set_index(["env", "method"])
+    assert returns.loc[("hopper", "e2r"), ["runs", "frames", "final_iqm", "prior"]].tolist() == [
+        3,
+        2,
+        301,
+        "good teacher",
+    ]
+    assert set(returns.index.get_level_values("method")) == {"none", "e2r", "ae2r slow"}
+    dynamics = pd.read_csv(tmp_path / "out/dynamics.csv").set_index(["env", "method", "metric"])
+    assert dynamics.loc[("ant", "e2r", "entropy"), "difference"] == 200
+    assert dynamics.loc[("ant", "ae2r slow", "loss_objective"), "mean"] == -200
+
+
+def test_it_is_the_same_every_time(tables, tmp_path):
+    for name in ("first", "second"):
+        report(config(tables, tmp_path / name))
+    for file in (tmp_path / "first").glob("*.csv"):
+        assert file.read_bytes() == (tmp_path / "second" / file.name).read_bytes()
+
+
+def test_a_table_without_means_of_training_is_enough_for_returns(tables, tmp_path):
+    tables.with_name("deep_training.csv").unlink()
+    report(config(tables, tmp_path / "out"))
+    assert (tmp_path / "out/returns.csv").exists()
+
+
+def test_a_method_that_is_unknown_is_left_out_by_name(tables, tmp_path, capsys):
+    tables.write_text(tables.read_text().replace("ae2r slow", "magic"))
+    report(config(tables, tmp_path / "out"))
+    assert "there is no method 'magic'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: text.replace("return", "reward", 1), "it has no column return"),
+        (lambda text: text.replace("300.0", "many"), "values of return are no numbers"),
+        (lambda text: "", "is damaged"),
+    ],
+)
+def test_a_damaged_table_is_named(damage, message, tables, tmp_path):
+    tables.write_text(damage(tables.read_text()))
+    with pytest.raises(ValueError, match=message) as error:
+        report(config(tables, tmp_path / "out"))
+    assert "deep.csv" in str(error.value)
