@@ -85,8 +85,8 @@ def expand(cfg: StudyConfig) -> list[StudyRun]:
         needed, known = {"environments", "methods", "seeds"}, {"environments", "methods", "seeds", "teachers", "set"}
         if not needed <= set(block) <= known:
             raise ValueError(f"runs[{number}]={dict(block)}: expected {sorted(needed)}, and of {sorted(known)} only.")
-        for env in block["environments"]:
-            for seed in _seeds(block["seeds"]):
+        for seed in _seeds(block["seeds"]):
+            for env in block["environments"]:
                 for label, settings in block["methods"].items():
                     for teacher in block.get("teachers", ["none"]):
                         run = _run(cfg, block, env, teacher, label, settings or {}, seed)

@@ -27,7 +27,9 @@ SHORT = {
     "recipes.gridworld": "worlds=2 teacher.steps=200 teacher.eval_episodes=1 evaluation.points=3 "
     "evaluation.interval=20 bootstrap.reps=20",
     "recipes.mujoco": "env.num_envs=2 env.frames_per_batch=64 env.minibatch_size=32 total_frames=128 ppo.epochs=1 "
-    "ppo.hidden=[8] evaluation.interval=64 evaluation.episodes=1 checkpoint.interval=128 compile=false",
+    "ppo.hidden=[8] evaluation.interval=64 evaluation.episodes=1 checkpoint.interval=128 compile=false "
+    "trial.max_frames=64 trial.min_frames=64",
+    "recipes.mujoco_study": "",
     "recipes.report": "bootstrap.reps=20",
     "recipes.export_best": "",
 }
