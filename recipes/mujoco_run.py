@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import shutil
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -16,13 +15,13 @@ import pandas as pd
 import torch
 from omegaconf import OmegaConf
 from torch import Tensor
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
 from tqdm import tqdm
 
+from recipes.checkpoints import Checkpoints
 from recipes.launchers import fail, in_sweep
 from recipes.loggers import RunLogger
 from recipes.mujoco_config import MujocoConfig, teachers
-from recipes.runs import RunFolder, digest, read_json, refuse_foreign
+from recipes.runs import RunFolder, digest, read_json
 from recipes.schedule_config import without_idle
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors.evaluation import Evaluation
@@ -64,7 +63,7 @@ class Run:
         self.folder = RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True))
         self.evaluations: list[dict[str, Any]] = []
         self.metrics: list[dict[str, Any]] = []
-        self.rotation = CheckpointRotation(path / "checkpoints", keep_last=cfg.checkpoint.keep)
+        self.checkpoints = Checkpoints(path / "checkpoints", cfg.checkpoint.keep, digest(matters))
 
     @property
     def status(self) -> dict[str, Any]:
@@ -81,12 +80,9 @@ class Run:
         """Who learns; loads their last checkpoint if the run is to be resumed, removes all checkpoints if not."""
         self.frames = 0
         self.students = students
-        if not self.cfg.resume and self.rotation.directory.exists():
-            shutil.rmtree(self.rotation.directory)
-        if self.cfg.resume and (latest := self.rotation.latest()) is not None:
-            refuse_foreign(latest)
-            self.rotation.load_latest(Checkpoint(stage=students), components=["stage"])
-            self.rotation.load_latest(Checkpoint(**students.parts()))
+        if not self.cfg.resume:
+            self.checkpoints.clear()
+        elif self.checkpoints.load({"stage": students}, students.parts):
             self.frames = students.frames
             self.evaluations = _rows_until(self.folder.path / "eval.csv", self.frames)
             self.metrics = _rows_until(self.folder.path / "metrics.csv", self.frames)
@@ -117,7 +113,7 @@ class Run:
         row = {"frames": frames} | {name: value.item() for name, value in metrics.items()}
         bad = [name for name, value in row.items() if name.startswith("loss_") and not math.isfinite(value)]
         if bad:
-            last = self.rotation.latest()
+            last = self.checkpoints.newest()
             raise TrainingError(
                 f"{', '.join(bad)} became NaN or infinite at {frames} frames; the last checkpoint before it is {last}."
             )
@@ -169,7 +165,7 @@ class Run:
         if frames >= self.next_checkpoint or frames >= self.cfg.total_frames:
             self.next_checkpoint = _next_multiple(frames, self.cfg.checkpoint.interval)
             self._write_tables()
-            self.rotation.save(Checkpoint(**self.students.parts()), step=frames)
+            self.checkpoints.save(self.students.parts(), frames)
             self.set_status("running", frames=frames)
 
     def finish(self, actor: Any, normalizer: Any, env_id: str, arm: str | None = None) -> None:

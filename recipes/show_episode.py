@@ -12,10 +12,10 @@ import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
+from recipes.checkpoints import Checkpoints
 from recipes.mujoco_agent import Agent
-from recipes.runs import refuse_foreign
+from recipes.runs import digest
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
 from torchrl_priors.collectors import VectorCollector, make_vector_env
 from torchrl_priors.collectors.vector_env import spread_seed
@@ -52,11 +52,10 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
     env = make_vector_env(env_id, 1, **cfg.env.kwargs)
     agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
     env.close()
-    rotation = CheckpointRotation(folder / "checkpoints", keep_last=cfg.checkpoint.keep)
-    if (latest := rotation.latest()) is None:
+    known = digest(json.loads((folder / "config.json").read_text()))
+    checkpoints = Checkpoints(folder / "checkpoints", cfg.checkpoint.keep, known)
+    if not checkpoints.load({"agent": agent}, dict):
         raise ValueError(f"{folder} has no checkpoint.")
-    refuse_foreign(latest)
-    rotation.load_latest(Checkpoint(agent=agent), components=["agent"])
     agent.normalizer.freeze()
     return agent, env_id
 

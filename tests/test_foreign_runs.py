@@ -46,7 +46,7 @@ def received(mujoco_run: Path, tmp_path: Path) -> Path:
 
 
 def newest(run: Path) -> Path:
-    return max((run / "checkpoints").iterdir())
+    return max(path for path in (run / "checkpoints").iterdir() if path.is_dir())
 
 
 def put_pickle(run: Path, ran: Path) -> None:
