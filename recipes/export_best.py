@@ -15,6 +15,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 from recipes.checks import check_keys, require_file_name
+from recipes.launchers import start
 from recipes.report_runs import Run, find, read
 from torchrl_priors.artifacts import read_manifest
 from torchrl_priors.artifacts.format import write_atomically
@@ -72,4 +73,4 @@ def main(cfg: ExportConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

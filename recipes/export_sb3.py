@@ -15,6 +15,7 @@ from omegaconf import MISSING
 from torchrl.modules import TanhNormal
 
 from recipes.checks import check_keys, require_file_name
+from recipes.launchers import start
 from torchrl_priors.artifacts import load_sb3_prior, save_prior
 from torchrl_priors.priors.mixture import distribution_class
 
@@ -65,4 +66,4 @@ def main(cfg: ExportConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

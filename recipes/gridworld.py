@@ -18,11 +18,11 @@ import hydra
 import numpy as np
 import torch
 from omegaconf import OmegaConf
-from tqdm import tqdm
 
 from recipes import gridworld_report, tabular, tabular_runs
 from recipes.gridworld_config import GridworldConfig, check
-from recipes.launchers import fail
+from recipes.launchers import fail, start
+from recipes.progress import progress_bar
 from recipes.runs import RunFolder, digest
 from recipes.schedule_config import applies, make_schedule, without_idle
 from torchrl_priors.envs import GridWorlds, sample_worlds
@@ -158,7 +158,8 @@ def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
     kept = {name: folder.arrays(name) for name in blocks if folder.has(name)}
     missing = [name for name in blocks if name not in kept]
     pool = ThreadPoolExecutor(cfg.workers or len(os.sched_getaffinity(0)))
-    with tqdm(total=cfg.worlds * per_world, unit="step", unit_scale=True, desc="compiling" if missing else None) as bar:
+    describe = "compiling" if missing else None
+    with progress_bar(total=cfg.worlds * per_world, unit="step", unit_scale=True, desc=describe) as bar:
 
         def progress(steps: int) -> None:
             bar.set_description("learning", refresh=False)
@@ -193,4 +194,4 @@ def main(cfg: GridworldConfig) -> str | None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-__all__ = ["SweepSummary", "cores", "fail", "in_sweep"]
+__all__ = ["SweepSummary", "cores", "fail", "in_sweep", "start"]
 
 
 def _installed(plugin: str) -> bool:
@@ -40,6 +42,13 @@ def cores(installed: bool) -> dict[str, Any]:
 
 
 ConfigStore.instance().store(group="hydra/launcher", name="cores", node=cores(_installed("hydra_joblib_launcher")))
+
+
+def start(main: Callable[[], Any]) -> None:
+    """Run a recipe's command. ``key=~/x`` is in one's home directory, which the shell and Hydra leave to others."""
+    home = re.compile(r"(?<==)~(?=/|$)")
+    sys.argv[1:] = [home.sub(str(Path.home()), word) for word in sys.argv[1:]]
+    main()
 
 
 def in_sweep() -> bool:

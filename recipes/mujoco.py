@@ -14,6 +14,7 @@ import time
 import hydra
 import torch
 
+from recipes.launchers import start
 from recipes.mujoco_config import MujocoConfig, check
 from recipes.mujoco_run import Run, supervise
 from recipes.mujoco_trial import Students
@@ -64,4 +65,4 @@ def main(cfg: MujocoConfig) -> str | None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

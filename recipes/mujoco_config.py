@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,7 @@ def teachers(cfg: MujocoConfig) -> list[Path]:
     """The teachers' files."""
     path = cfg.prior.path
     several = path if isinstance(path, Sequence) and not isinstance(path, str) else [path]
-    return [] if path is None else [Path(str(one)) for one in several]
+    return [] if path is None else [Path(str(one)).expanduser() for one in several]
 
 
 def method_of(cfg: MujocoConfig) -> MethodSpec:
@@ -247,6 +248,10 @@ def check(cfg: MujocoConfig) -> None:
     expected = f"a multiple of env.frames_per_batch={batch}, such as {near}"
     _require(frames % batch == 0, "total_frames", frames, expected)
     require_logger(cfg.logger)
+    if find_spec("safetensors") is None:  # found missing when the policy is saved, it would cost the run
+        raise ImportError(
+            "safetensors is missing, and the policy is saved by it: pip install 'torchrl-priors[recipes]'."
+        )
     require_compiler(cfg.compile)
     obs_dim, act_dim = _check_env(cfg)
     for file in files if cfg.method != "none" else ():

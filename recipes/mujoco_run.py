@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import signal
+import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +24,7 @@ from recipes.checkpoints import Checkpoints
 from recipes.launchers import fail, in_sweep
 from recipes.loggers import RunLogger
 from recipes.mujoco_config import MujocoConfig, teachers
+from recipes.progress import progress_bar
 from recipes.runs import RunFolder, digest, read_json
 from recipes.schedule_config import without_idle
 from torchrl_priors.artifacts import save_policy
@@ -38,6 +42,11 @@ _INCIDENTAL = ("out", "resume", "logger", "checkpoint")
 
 class TrainingError(RuntimeError):
     """Training cannot go on; the last good checkpoint is kept."""
+
+
+def identity(matters: dict[str, Any]) -> str:
+    """What tells the checkpoints of a run from those of others: all that its results depend on, but for its length."""
+    return digest({key: value for key, value in matters.items() if key != "total_frames"})
 
 
 class Run:
@@ -58,12 +67,16 @@ class Run:
             one = isinstance(cfg.prior.path, str)
             matters["prior"] |= {"path": names[0] if one else names, "sha256": digests[0] if one else digests}
         env = f"{cfg.env.id}-{cfg.env.version}"
-        path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}")
+        path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}").expanduser()
         self.cfg = cfg
-        self.folder = RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True))
+        self.frames = 0
+        self.is_to_stop = False
+        # what a run did up to a number of frames does not depend on how many are to come, but for these
+        longer = [] if "schedule" in matters or "let_go" in matters else ["total_frames"]
+        self.folder = RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True), may_grow=longer)
         self.evaluations: list[dict[str, Any]] = []
         self.metrics: list[dict[str, Any]] = []
-        self.checkpoints = Checkpoints(path / "checkpoints", cfg.checkpoint.keep, digest(matters))
+        self.checkpoints = Checkpoints(path / "checkpoints", cfg.checkpoint.keep, identity(matters))
 
     @property
     def status(self) -> dict[str, Any]:
@@ -89,7 +102,7 @@ class Run:
         self.next_evaluation = _next_multiple(self.frames, self.cfg.evaluation.interval)
         self.next_checkpoint = _next_multiple(self.frames, self.cfg.checkpoint.interval)
         self.set_status("running", frames=self.frames)
-        self.bar = tqdm(
+        self.bar = progress_bar(
             total=self.cfg.total_frames, initial=self.frames, unit="frame", unit_scale=True, disable=in_sweep()
         )
         self.logger = None
@@ -131,7 +144,7 @@ class Run:
         """Keep who won the trials so far, and say who won the last."""
         text = json.dumps([result._asdict() for result in results], indent=1)
         self.folder.write("trials.json", lambda path: path.write_text(text))
-        tqdm.write(f"{self.folder.path}: {results[-1]}")
+        tqdm.write(f"{self.folder.path}: {results[-1]}", file=sys.stderr)
 
     def evaluation_is_due(self, frames: int) -> bool:
         """Whether the policy is to be evaluated now: every ``evaluation.interval`` frames and at the end."""
@@ -161,12 +174,18 @@ class Run:
         self._write_tables()
 
     def checkpoint_if_due(self, frames: int) -> None:
-        """Save everything every ``checkpoint.interval`` frames and at the end."""
-        if frames >= self.next_checkpoint or frames >= self.cfg.total_frames:
+        """Save everything every ``checkpoint.interval`` frames, at the end, and when the process is to stop.
+
+        Raises:
+            Stopped: it is to stop.
+        """
+        if frames >= self.next_checkpoint or frames >= self.cfg.total_frames or self.is_to_stop:
             self.next_checkpoint = _next_multiple(frames, self.cfg.checkpoint.interval)
             self._write_tables()
             self.checkpoints.save(self.students.parts(), frames)
             self.set_status("running", frames=frames)
+        if self.is_to_stop and frames < self.cfg.total_frames:
+            raise Stopped(f"{self.folder.path}: asked to stop (SIGTERM), saved at {frames} frames")
 
     def finish(self, actor: Any, normalizer: Any, env_id: str, arm: str | None = None) -> None:
         """Export the policy as a teacher, and say that the run is done."""
@@ -194,6 +213,10 @@ class Run:
             self.folder.write(f"{name}.csv", partial(table.to_csv, index=False))
 
 
+class Stopped(Exception):
+    """The process was asked to end, and the run is saved."""
+
+
 def supervise(
     cfg: MujocoConfig, check: Callable[[MujocoConfig], None], train: Callable[[MujocoConfig, Run], None]
 ) -> str | None:
@@ -203,18 +226,44 @@ def supervise(
     try:
         check(cfg)
         opened = Run(cfg)
-        if opened.status.get("state") == "finished" and cfg.resume:
+        if opened.status.get("state") == "finished" and opened.status["frames"] >= cfg.total_frames and cfg.resume:
             print(f"{opened.folder.path}: finished already", flush=True)
             return None
         run = opened  # from here on there is a status to write
-        train(cfg, run)
+        with _sigterm(run):
+            train(cfg, run)
+    except (KeyboardInterrupt, Stopped) as reason:
+        what = "Interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
+        if run is not None:
+            run.set_status("interrupted", frames=run.frames)
+        print(f"{what}: the same command continues.", file=sys.stderr, flush=True)
+        sys.exit(130 if isinstance(reason, KeyboardInterrupt) else 143)
     except Exception as error:
         if run is not None:
-            run.set_status("failed", frames=getattr(run, "frames", 0), error=str(error))
+            with suppress(OSError):  # a full disk, say
+                run.set_status("failed", frames=run.frames, error=str(error))
         if not isinstance(error, (ValueError, OSError, ImportError, TrainingError)):
             traceback.print_exc()
         return fail(f"Error: {error}")
     return None
+
+
+@contextmanager
+def _sigterm(run: Run) -> Iterator[None]:
+    """What a cluster sends before it takes the machine away: the run is saved after the rollout at hand."""
+
+    def stop(*_: Any) -> None:
+        run.is_to_stop = True
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not the main thread
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _next_multiple(frames: int, interval: int) -> int:

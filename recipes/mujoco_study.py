@@ -26,6 +26,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from recipes.checks import check_keys
+from recipes.launchers import start
 from torchrl_priors.artifacts.format import write_atomically
 
 #: What a run is known by in the tables.
@@ -259,4 +260,4 @@ def main(cfg: StudyConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -18,6 +18,7 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from recipes import report_gridworld
+from recipes.launchers import start
 from recipes.report_config import ReportConfig, check
 from recipes.report_figures import TRAINING, curve_table, figures
 from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
@@ -218,4 +219,4 @@ def main(cfg: ReportConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

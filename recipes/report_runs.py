@@ -16,6 +16,7 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from recipes.report_config import ReportConfig
+from recipes.runs import RunFolder
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
 __all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "short_paths", "without_misfits"]
@@ -142,6 +143,9 @@ def _check_finished(folder: Path) -> dict[str, Any]:
         raise _UnusableError("status.json is damaged") from None
     if state == "failed":
         raise _UnusableError(f"it failed: {status.get('error') or 'no reason given'}")
+    if state in ("running", "interrupted") and not RunFolder.is_at_work(folder):
+        frames = status.get("frames", "unknown")
+        raise _UnusableError(f"it is not finished: broken off after {frames} frames, and continued by the same command")
     if state != "finished":
         raise _UnusableError(f"it is not finished (state {state}, {status.get('frames', 'unknown')} frames)")
     return dict(status)

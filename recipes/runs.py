@@ -9,7 +9,7 @@ import shutil
 import sys
 import weakref
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,7 @@ class RunFolder:
         path (Path): created if needed.
         config (dict): everything that the results depend on, as plain values.
         text (str): the resolved configuration as the user may read it, kept as ``config.yaml``.
+        may_grow (sequence of str): keys whose number may be larger than it was.
 
     Raises:
         OSError: the folder cannot be written.
@@ -83,14 +84,15 @@ class RunFolder:
             else; or another process is at work in it.
     """
 
-    def __init__(self, path: Path, config: dict[str, Any], text: str) -> None:
+    def __init__(self, path: Path, config: dict[str, Any], text: str, may_grow: Sequence[str] = ()) -> None:
+        path = path.expanduser()
         self.path, self.config = path, config
         stamp = path / "config.json"
         try:
             path.mkdir(parents=True, exist_ok=True)
             known = stamp.exists()
             if known:
-                self._check_same(read_json(stamp), config)
+                self._check_same(read_json(stamp), config, may_grow)
             elif (path / "config.yaml").exists():
                 raise ValueError(f"out={path} holds a config.yaml that is not of this recipe: choose another folder.")
             self._lock()
@@ -104,12 +106,13 @@ class RunFolder:
         except OSError as error:
             raise OSError(f"Cannot write the results to out={path}: {error}") from error
 
-    def _check_same(self, theirs: dict[str, Any], ours: dict[str, Any]) -> None:
+    def _check_same(self, theirs: dict[str, Any], ours: dict[str, Any], may_grow: Sequence[str]) -> None:
         before, now = _flatten(theirs), _flatten(ours)
         changed = [
             f"{name}: {before.get(name, 'absent')} -> {now.get(name, 'absent')}"
             for name in sorted(before.keys() | now.keys())
             if before.get(name, "absent") != now.get(name, "absent")
+            and not (name in may_grow and name in before and now[name] >= before[name])
         ]
         if changed:
             raise ValueError(
@@ -130,6 +133,21 @@ class RunFolder:
             ) from None
         except OSError:
             pass  # a file system without locks
+
+    @staticmethod
+    def is_at_work(path: Path) -> bool:
+        """Whether a process other than this one is at work in a folder; where that can't be told, True."""
+        try:
+            descriptor = os.open(path / ".lock", os.O_RDWR)
+        except OSError:
+            return sys.platform == "win32"
+        try:
+            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
 
     def _remove_leftovers(self) -> None:
         """Remove what was being written when the process was killed."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from recipes.checkpoints import Checkpoints
 from recipes.mujoco_agent import Agent
-from recipes.runs import digest
+from recipes.mujoco_run import identity
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
 from torchrl_priors.collectors import VectorCollector, make_vector_env
 from torchrl_priors.collectors.vector_env import spread_seed
@@ -52,7 +52,7 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
     env = make_vector_env(env_id, 1, **cfg.env.kwargs)
     agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
     env.close()
-    known = digest(json.loads((folder / "config.json").read_text()))
+    known = identity(json.loads((folder / "config.json").read_text()))
     checkpoints = Checkpoints(folder / "checkpoints", cfg.checkpoint.keep, known)
     if not checkpoints.load({"agent": agent}, dict):
         raise ValueError(f"{folder} has no checkpoint.")

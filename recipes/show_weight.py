@@ -19,6 +19,7 @@ from omegaconf import MISSING, OmegaConf
 
 from recipes.checks import check_keys
 from recipes.gridworld import TaughtWorld, make_learner
+from recipes.launchers import start
 from recipes.report_runs import is_gridworld
 from recipes.tabular_runs import parse_prior
 from torchrl_priors import plots
@@ -140,4 +141,4 @@ def main(cfg: ShowConfig) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)
