@@ -151,15 +151,13 @@ class Tables:
             ),
             "_trials": pd.DataFrame(),
         }
-        if (run.folder / "trial.json").exists():
-            trial = json.loads((run.folder / "trial.json").read_text())
-            trial["frames"] = sum(trial["frames"].values())
-            new["_trials"] = pd.DataFrame(
-                [{name: trial[name] for name in ("winner", "margin", "confidence", "frames")}]
-            )
-        for kind, rows in new.items():
-            if len(rows):
-                self.rows[kind] = pd.concat([self.rows[kind], rows.assign(**key)[[*KEY, *rows]]], ignore_index=True)
+        if (run.folder / "trials.json").exists():
+            trials = json.loads((run.folder / "trials.json").read_text())
+            rows = [trial | {"frames": sum(trial["frames"].values())} for trial in trials]
+            new["_trials"] = pd.DataFrame(rows)[list(TRIAL)]
+        for kind, table in new.items():
+            if len(table):
+                self.rows[kind] = pd.concat([self.rows[kind], table.assign(**key)[[*KEY, *table]]], ignore_index=True)
                 self._write(kind)
         return float(evaluations["mean_return"].iloc[-1])
 

@@ -105,6 +105,20 @@ def test_what_is_missing_is_run_and_what_failed_stops_nothing(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("here")
+def test_who_won_a_trial_is_in_a_table_of_its_own(tmp_path):
+    study(config(tmp_path, [ONE]))
+    policy = tmp_path / "work/hopper/none-none-0/policy.safetensors"
+    short = {"prior.path": str(policy), "trial.max_frames": 64, "trial.min_frames": 64}
+    block = {"environments": ["hopper"], "methods": {"trial": short}, "teachers": ["good"], "seeds": [0]}
+    study(config(tmp_path, [block]))
+    row = pd.read_csv(tmp_path / "tables/tiny_trials.csv").iloc[0]
+    assert row[["env", "teacher", "method", "seed", "winner", "frames"]].tolist() == [
+        *("hopper", "good", "trial", 0),
+        *("alone", 128),
+    ]
+
+
+@pytest.mark.usefixtures("here")
 def test_a_finished_run_that_is_not_in_the_tables_is_taken_in(tmp_path):
     study(config(tmp_path, [ONE]))
     whole = (tmp_path / "tables/tiny.csv").read_bytes()
