@@ -39,6 +39,9 @@ _COMPARISONS = (
     ("aligned", "kl_penalty"),
     ("ae2r", "annealed_kickstart"),
     ("ae2r", "kl_penalty"),
+    ("pull", "annealed_kickstart"),
+    ("pull", "aligned"),
+    ("pull", "ae2r"),
 )
 
 
