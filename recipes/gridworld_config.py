@@ -152,8 +152,9 @@ def check(cfg: GridworldConfig) -> None:
         cfg.world.end_prob,
         "a number in (0, 1], or episodes may never end",
     )
-    rates = {"teacher.lr": cfg.teacher.lr, "student.lr": cfg.student.lr}
-    rates |= {f"student.lr_weight.{name}": cfg.student.lr_weight[name] for name in ("original", "shaped", "advantage")}  # type: ignore[index]
+    for key, value in {"teacher.lr": cfg.teacher.lr, "student.lr": cfg.student.lr}.items():
+        _require(0 < value < float("inf"), key, value, "a positive number")
+    rates = {f"student.lr_weight.{name}": cfg.student.lr_weight[name] for name in ("original", "shaped", "advantage")}  # type: ignore[index]
     rates |= {"student.bonus_coeff": cfg.student.bonus_coeff, "student.aux_coeff": cfg.student.aux_coeff or 0.0}
     for key, value in rates.items():
         _require(0 <= value < float("inf"), key, value, "a number of at least 0")

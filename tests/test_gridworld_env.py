@@ -264,3 +264,11 @@ def test_render_takes_overlays_per_cell(overlay):
     figure = env.render(**overlay)
     assert isinstance(figure, Figure)
     assert not np.array_equal(pixels(figure), pixels(env.render()))
+
+
+@pytest.mark.parametrize("action", [-1, 4])
+def test_an_action_that_there_is_not_is_refused(action: int) -> None:
+    env = GridWorldEnv(sample_worlds(torch.arange(2)))
+    state = env.reset().set("action", torch.tensor([0, action]))
+    with pytest.raises(ValueError, match=rf"Actions are 0 to 3 .*, got {min(0, action)} to {max(0, action)}\."):
+        env.step(state)

@@ -210,6 +210,7 @@ def test_worlds_are_the_same_in_a_larger_study(small, tmp_path):
         ("priors=[]", "priors"),
         ("td_error=nonsense", "td_error=nonsense"),
         ("student.lr=-0.1", "student.lr=-0.1"),
+        ("teacher.lr=0", "teacher.lr=0.0: expected a positive number"),
         ("student.lr=nan", "student.lr=nan"),
         ("student.lr_weight.original=-1", "student.lr_weight.original=-1"),
         ("teacher.lr=-1", "teacher.lr=-1"),

@@ -165,9 +165,13 @@ class GridWorldEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"]
+        if not torch.compiler.is_compiling() and not ((action >= 0) & (action < 4)).all():
+            low, high = int(action.min()), int(action.max())
+            raise ValueError(f"Actions are 0 to 3 (up, right, down, left), got {low} to {high}.")
         slip, end = torch.rand(2, *self.batch_size, generator=self.generator).to(self.device)
         position, reward, terminated = transition(
-            self.maps, tensordict["position"], tensordict["action"], slip, end, noise=self.noise, end_prob=self.end_prob
+            self.maps, tensordict["position"], action, slip, end, noise=self.noise, end_prob=self.end_prob
         )
         terminated = terminated.unsqueeze(-1)
         return TensorDict(
