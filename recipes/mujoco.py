@@ -43,11 +43,11 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         evaluate_policy()
     if cfg.compile:
         run.announce("compiling")
-    start, first = time.perf_counter(), students.frames
+    began, first = time.perf_counter(), students.frames
     while students.frames < cfg.total_frames:
         known = len(students.results)
         for arm, metrics, weights in students.round():
-            metrics["fps"] = torch.tensor((students.frames - first) / (time.perf_counter() - start))
+            metrics["fps"] = torch.tensor((students.frames - first) / (time.perf_counter() - began))
             run.log(students.frames, metrics, weights, arm=arm if students.several else None)
             if run.evaluation_is_due(students.frames):  # of trials, too, at the same frames as of any other run
                 evaluate_policy()
