@@ -190,7 +190,7 @@ def _env(node: Any) -> str:
 
 def spec_of(method: str, settings: Mapping[str, Any]) -> MethodSpec:
     """The settings of a run's method, or of that which its trial tries."""
-    tried = settings.get("trial.method") or (settings.get("trial") or {}).get("method", "")
+    tried = settings.get("trial.method") or (settings.get("trial") or {}).get("method", "none")
     return get_method(str(tried) if method == "trial" else method)
 
 

@@ -27,7 +27,12 @@ def tables(tmp_path) -> Path:
     """Two environments, a good teacher, three seeds; the return of a method is easy to see."""
     rows, means = [], []
     for env in ("hopper", "ant"):
-        for teacher, method, level in (("none", "none", 100.0), ("good", "e2r", 300.0), ("good", "ae2r slow", 200.0)):
+        for teacher, method, level in (
+            ("none", "none", 100.0),
+            ("good", "e2r", 300.0),
+            ("good", "ae2r slow", 200.0),
+            ("good", "trial", 250.0),
+        ):
             for seed in range(3):
                 key = (env, teacher, method, seed)
                 rows += [(*key, frames, level * frames / 2 + seed) for frames in (0, 1, 2)]
@@ -48,7 +53,7 @@ def test_returns_and_differences_come_from_the_tables(tables, tmp_path):
         301,
         "good teacher",
     ]
-    assert set(returns.index.get_level_values("method")) == {"none", "e2r", "ae2r slow"}
+    assert set(returns.index.get_level_values("method")) == {"none", "e2r", "ae2r slow", "trial"}
     dynamics = pd.read_csv(tmp_path / "out/dynamics.csv").set_index(["env", "method", "metric"])
     assert dynamics.loc[("ant", "e2r", "entropy"), "difference"] == 200
     assert dynamics.loc[("ant", "ae2r slow", "loss_objective"), "mean"] == -200
