@@ -102,7 +102,7 @@ def standing_still(teachers) -> list[str]:
 
 
 def test_a_student_that_stands_still_is_tried_without_its_teacher(standing_still, tmp_path, monkeypatch):
-    monkeypatch.setattr(Plateau, "reached", property(lambda self: self._returns.frames >= 256))
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 256))
     out = run(tmp_path, *standing_still, "total_frames=640")
     rows = pd.read_csv(out / "metrics.csv")
     kept, twin = "kickstart", "kickstart, let go"
@@ -115,7 +115,7 @@ def test_a_student_that_stands_still_is_tried_without_its_teacher(standing_still
 
 
 def test_a_teacher_that_stays_is_tried_again_after_twice_the_frames(standing_still, tmp_path, monkeypatch):
-    monkeypatch.setattr(Plateau, "reached", property(lambda self: self._returns.frames >= 128))
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 128))
     always(monkeypatch, "kickstart")
     out = run(tmp_path, *standing_still, "total_frames=768")
     rows = pd.read_csv(out / "metrics.csv")
@@ -127,7 +127,7 @@ def test_a_teacher_that_stays_is_tried_again_after_twice_the_frames(standing_sti
 
 @pytest.mark.parametrize("stop", [256, 384, 576])  # before, in and after the trial with the twin
 def test_an_interrupted_run_with_a_twin_gives_the_same_files(stop, standing_still, tmp_path, monkeypatch):
-    monkeypatch.setattr(Plateau, "reached", property(lambda self: self._returns.frames >= 256))
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 256))
     options = [*standing_still, "ppo.lr=1e-3", "total_frames=640"]
     whole = run(tmp_path / "whole", *options)
     interrupt(monkeypatch, tmp_path / "stopped", stop, *options)

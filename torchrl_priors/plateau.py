@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from tensordict import NestedKey, TensorDictBase
 
 from torchrl_priors.episode_returns import EpisodeReturns, welch
@@ -12,7 +9,7 @@ from torchrl_priors.episode_returns import EpisodeReturns, welch
 __all__ = ["Plateau"]
 
 
-class Plateau:
+class Plateau(EpisodeReturns):
     r"""Sees from a student's batches whether its returns still rise: a teacher that does not help any more may go.
 
     With :math:`R` the mean return of the episodes that ended in the last ``window`` frames, :math:`R'` that of the
@@ -61,34 +58,18 @@ class Plateau:
         if not 0 <= gain < float("inf"):
             raise ValueError(f"gain must be at least 0, got {gain}.")
         self.window, self.min_episodes, self.gain = window, min_episodes, gain
-        self._returns = EpisodeReturns(return_key=return_key, done_key=done_key)
+        super().__init__(return_key=return_key, done_key=done_key)
 
     def update(self, batch: TensorDictBase) -> None:
-        """Read a batch.
-
-        Args:
-            batch (TensorDictBase): ``[*B]``, all frames that were made since the last batch.
-
-        Raises:
-            KeyError: an entry is missing.
-            ValueError: a return is not finite.
-        """
-        self._returns.update(batch)
-        self._returns.forget(2 * self.window)
+        """Read a batch, and forget what no window holds any more; see :meth:`EpisodeReturns.update`."""
+        super().update(batch)
+        self.forget(2 * self.window)
 
     @property
     def reached(self) -> bool:
         """Whether returns have stopped to rise."""
-        recent, before = self._returns.within(self.window), self._returns.within(self.window, ago=self.window)
-        if self._returns.frames < 2 * self.window or min(len(recent), len(before)) < self.min_episodes:
+        recent, before = self.within(self.window), self.within(self.window, ago=self.window)
+        if self.frames < 2 * self.window or min(len(recent), len(before)) < self.min_episodes:
             return False
         rise, error = welch(recent, before)
         return rise <= max(error, self.gain * abs(float(before.mean())))
-
-    def state_dict(self) -> dict[str, Any]:
-        """What was read, as plain values."""
-        return self._returns.state_dict()
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from what was saved."""
-        self._returns.load_state_dict(state_dict)
