@@ -8,9 +8,13 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import mujoco
 import numpy as np
 
-__all__ = ["TASKS", "Task"]
+__all__ = ["READ", "TASKS", "Task"]
+
+READ = ("qpos", "qvel", "ctrl", "xpos", "xipos", "cinert", "cvel", "cfrc_ext", "qfrc_actuator")
+"""What the formulas read of the simulator's data."""
 
 
 class _Rows:
@@ -48,6 +52,7 @@ class Task:
         self.bases, self.version = bases, version
         self.base = bases[0]  # its settings are those of all
         self.dt: float = self.base.dt
+        self.models, self.data = [base.model for base in bases], [base.data for base in bases]
         skipped = self.skipped * bool(self.base._exclude_current_positions_from_observation)
         rows = [[base.data.qpos[skipped:], base.data.qvel, *self.observed(base)] for base in bases]
         self.positions = sum(array.size for array in rows[0][:1])
@@ -79,6 +84,14 @@ class Task:
     def before(self) -> None:
         """Remembers where the bodies are, before a step."""
         self._start = self.place()
+
+    def simulate(self, actions: np.ndarray, data: Sequence[Any]) -> None:
+        """Gymnasium's physical step, of each environment's data."""
+        frame_skip = self.base.frame_skip
+        for model, state, action in zip(self.models, data, actions, strict=True):
+            state.ctrl[:] = action
+            mujoco.mj_step(model, state, frame_skip)
+            mujoco.mj_rnePostConstraint(model, state)
 
     def after(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Observations, rewards and which episodes terminated, after a step."""

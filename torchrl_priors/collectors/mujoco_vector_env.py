@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from gymnasium import Env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
-from torchrl_priors.collectors.mujoco_tasks import TASKS, Task
+from torchrl_priors.collectors.mujoco_tasks import READ, TASKS, Task
 
 __all__ = ["MujocoVectorEnv"]
 
@@ -41,7 +42,12 @@ class MujocoVectorEnv(SyncVectorEnv):
         super().__init__(env_fns, autoreset_mode=AutoresetMode.DISABLED)
         self._task = _find_task(self.envs)
         self._steps = 0
-        self._limits = [[layer for layer in _layers(env) if isinstance(layer, TimeLimit)] for env in self.envs]
+        self._limits: list[tuple[int, Any]] = [
+            (number, layer)
+            for number, env in enumerate(self.envs)
+            for layer in _layers(env)
+            if isinstance(layer, TimeLimit)
+        ]
 
     @property
     def fast(self) -> bool:
@@ -65,21 +71,28 @@ class MujocoVectorEnv(SyncVectorEnv):
             return self._checked_step(task, actions)
         assert True not in self._autoreset_envs.tolist(), "An episode that ended has to be reset first."
         task.before()
-        for base, action in zip(task.bases, actions, strict=True):
-            base._step_mujoco_simulation(action, base.frame_skip)
+        task.simulate(actions, task.data)
         obs, reward, terminated = task.after(actions)
-        truncated = np.array([_last(limits) for limits in self._limits])
+        truncated = np.zeros(self.num_envs, np.bool_)
+        for number, limit in self._limits:
+            limit._elapsed_steps += 1
+            if limit._elapsed_steps >= limit._max_episode_steps:
+                truncated[number] = True
         self._observations = obs.copy()
         self._terminations, self._truncations = terminated.copy(), truncated.copy()
         self._autoreset_envs = terminated | truncated
         return obs, reward, terminated, truncated, {}
 
     def _checked_step(self, task: Task, actions: np.ndarray) -> _Step:
-        """The superclass's step, and whether the task's formulas give the same."""
+        """The superclass's step, and whether the physics and the task's formulas give the same."""
         task.before()
+        twins = [copy(base.data) for base in task.bases]
         step = super().step(actions)
         try:
-            pairs = zip(step[:3], task.after(actions), strict=True)
+            task.simulate(actions, twins)
+            pairs = [*zip(step[:3], task.after(actions), strict=True)]
+            for base, twin in zip(task.bases, twins, strict=True):
+                pairs += [(getattr(base.data, name), getattr(twin, name)) for name in READ]
             same = all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
         except _UNEXPECTED:
             same = False
@@ -122,12 +135,3 @@ def _settings(base: Any) -> dict[str, Any]:
     """What an environment was made with, as far as its formulas read it."""
     simple = (bool, int, float, str, tuple)
     return {"dt": base.dt, **{name: value for name, value in vars(base).items() if isinstance(value, simple)}}
-
-
-def _last(limits: list[Any]) -> bool:
-    """Counts a step; whether it was the last one."""
-    last = False
-    for limit in limits:
-        limit._elapsed_steps += 1
-        last |= limit._elapsed_steps >= limit._max_episode_steps
-    return last

@@ -166,7 +166,9 @@ class VectorCollector:
         observations, next_observations = (np.empty((*shape, *obs.shape[1:]), np.float32) for _ in range(2))
         rewards, episode_rewards = (np.empty(shape, np.float32) for _ in range(2))
         terminations, truncations = (np.empty(shape, np.bool_) for _ in range(2))
-        step_counts, traj_ids = (np.empty(shape, np.int64) for _ in range(2))
+        # column t is of the step t, the last one of the step to come
+        step_counts = self._step_count[:, None] + np.arange(steps + 1)
+        traj_ids = np.repeat(self._traj_ids[:, None], steps + 1, axis=1)
         sent = np.empty((num_envs, *env.single_action_space.shape), env.single_action_space.dtype)
         inputs = {self.observation_key: torch.from_numpy(obs)}
         if self.normalizer is not None:
@@ -182,7 +184,6 @@ class VectorCollector:
         with self._step.session(self._generator, deterministic=False):
             for t in range(steps):
                 observations[:, t] = obs
-                traj_ids[:, t] = self._traj_ids
                 if self.normalizer is not None:
                     np.subtract(obs, mean, out=policy_input)
                     np.multiply(policy_input, inverse_std, out=policy_input)
@@ -214,34 +215,34 @@ class VectorCollector:
                 terminations[:, t] = terminated
                 truncations[:, t] = truncated
                 self._episode_reward += reward
-                self._step_count += 1
                 episode_rewards[:, t] = self._episode_reward
-                step_counts[:, t] = self._step_count
                 obs[...] = next_obs
                 done = terminated | truncated
                 if True in done.tolist():  # a fraction of what `any` takes
-                    self._begin_episodes(done)
+                    self._begin_episodes(done, step_counts[:, t + 1 :], traj_ids[:, t + 1 :])
 
+        self._step_count, self._traj_ids = step_counts[:, -1].copy(), traj_ids[:, -1].copy()
         return self._batch(
             written,
             observation=observations,
-            traj_ids=traj_ids,
+            traj_ids=traj_ids[:, :-1],
             next_observation=next_observations,
             reward=rewards,
             terminated=terminations,
             truncated=truncations,
             episode_reward=episode_rewards,
-            step_count=step_counts,
+            step_count=step_counts[:, :-1] + 1,
         )
 
-    def _begin_episodes(self, where: np.ndarray) -> None:
+    def _begin_episodes(self, where: np.ndarray, step_counts: np.ndarray, traj_ids: np.ndarray) -> None:
+        """Of some environments; what is counted of the steps to come begins with them."""
         fresh, _ = self.env.reset(options={"reset_mask": where})
         self._obs[where] = fresh[where]
         number = int(where.sum())
-        self._traj_ids[where] = np.arange(self._next_traj_id, self._next_traj_id + number)
+        traj_ids[where] = np.arange(self._next_traj_id, self._next_traj_id + number)[:, None]
         self._next_traj_id += number
         self._episode_reward[where] = 0
-        self._step_count[where] = 0
+        step_counts[where] = np.arange(step_counts.shape[1])
 
     def _batch(self, written: Mapping[NestedKey, Tensor], **arrays: np.ndarray) -> TensorDict:
         """The tensordict of a rollout: of what the policy wrote and of what the environments gave."""
