@@ -14,6 +14,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from tensordict import TensorDict
 
+import recipes.launchers  # noqa: F401  registers the launcher that conf/mujoco.yaml names
 from recipes.checks import check_keys, require_compiler
 from recipes.loggers import LOGGERS, require_logger
 from recipes.schedule_config import ScheduleConfig, check_schedule
