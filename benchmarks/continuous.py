@@ -33,7 +33,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torchrl.collectors import Collector
 from torchrl.envs import DoubleToFloat, GymEnv, SerialEnv, TransformedEnv
 
-from recipes.mujoco_agent import Agent, Optimiser
+from recipes.mujoco.agent import Agent, Optimiser
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate, make_vector_env
 from torchrl_priors.networks import make_actor

@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from hydra import compose, initialize_config_dir
 
-from recipes.gridworld import TaughtWorld, make_learner, sample_world
+from recipes.gridworld.study import TaughtWorld, make_learner, sample_world
 from torchrl_priors.methods import METHODS
 
 CONF = str(Path(__file__).parents[1] / "conf")

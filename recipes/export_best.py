@@ -14,9 +14,9 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import check_keys, require_file_name
-from recipes.launchers import start
-from recipes.report_runs import Run, find, read
+from recipes.common.checks import check_keys, require_file_name
+from recipes.common.sweeps import start
+from recipes.report.runs import Run, find, read
 from torchrl_priors.artifacts import read_manifest
 from torchrl_priors.artifacts.format import write_atomically
 

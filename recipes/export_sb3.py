@@ -14,8 +14,8 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from torchrl.modules import TanhNormal
 
-from recipes.checks import check_keys, require_file_name
-from recipes.launchers import start
+from recipes.common.checks import check_keys, require_file_name
+from recipes.common.sweeps import start
 from torchrl_priors.artifacts import load_sb3_prior, save_prior
 from torchrl_priors.priors.mixture import distribution_class
 

@@ -25,8 +25,8 @@ import pandas as pd
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from recipes.checks import check_keys
-from recipes.launchers import start
+from recipes.common.checks import check_keys
+from recipes.common.sweeps import start
 from torchrl_priors.artifacts.format import write_atomically
 
 #: What a run is known by in the tables.

@@ -8,9 +8,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from recipes import mujoco as recipe
-from recipes.mujoco_config import check
-from recipes.mujoco_run import supervise
+from recipes.mujoco.config import check
+from recipes.mujoco.run import Run, supervise
+from recipes.mujoco.train import train
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -33,7 +33,7 @@ def config(out: Path, *overrides: str) -> DictConfig:
 
 
 def run(out: Path, *overrides: str) -> Path:
-    supervise(config(out, *overrides), check, recipe.train)
+    supervise(config(out, *overrides), check, train)
     return out
 
 
@@ -43,7 +43,7 @@ class Interrupted(BaseException):
 
 def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *overrides: str) -> None:
     """Start a run that is broken off after the rollout that ends at ``frames``."""
-    log = recipe.Run.log
+    log = Run.log
 
     def stopping(self, at, *args, **kwargs):
         log(self, at, *args, **kwargs)
@@ -51,6 +51,6 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *override
             raise Interrupted
 
     with monkeypatch.context() as patch:
-        patch.setattr(recipe.Run, "log", stopping)
+        patch.setattr(Run, "log", stopping)
         with pytest.raises(Interrupted):
             run(out, *overrides)

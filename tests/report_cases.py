@@ -11,7 +11,7 @@ import pandas as pd
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-import recipes.report_config  # noqa: F401 (stores the schema)
+import recipes.report.config  # noqa: F401 (stores the schema)
 from torchrl_priors.methods import get_method
 
 ROOT = Path(__file__).parents[1]

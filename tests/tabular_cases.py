@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from recipes import tabular, tabular_runs
+from recipes.gridworld import learners, tabular
 from torchrl_priors.envs import GridWorlds
 from torchrl_priors.envs.worlds import KINDS, MOVES
 from torchrl_priors.methods import get_method
@@ -46,29 +46,29 @@ class Run(NamedTuple):
     prior: str
     world_index: int
     td_error: str
-    world: tabular_runs.World
+    world: learners.World
     q: np.ndarray
-    advice: tabular_runs.Advice
-    learner: tabular_runs.Learner
+    advice: learners.Advice
+    learner: learners.Learner
 
 
 def make_run(method: str, prior: str, world: int = 0, td_error: str = "original", end_prob: float = 0.06) -> Run:
     q = action_values(world)
-    advice = tabular_runs.make_advice(tabular_runs.parse_prior(prior or "expert"), q, np.ones(STATES, bool), 1.5, world)
-    learner = tabular_runs.learner_of(
+    advice = learners.make_advice(learners.parse_prior(prior or "expert"), q, np.ones(STATES, bool), 1.5, world)
+    learner = learners.learner_of(
         method,
         lr_weight=RATES,
         td_error=td_error,
         schedule=SCHEDULE if get_method(method).annealed else None,
         **COEFFS,
     )
-    where = tabular_runs.World.of(drawn_worlds()[world : world + 1], 0.1, end_prob)
+    where = learners.World.of(drawn_worlds()[world : world + 1], 0.1, end_prob)
     return Run(method, prior, world, td_error, where, q, advice, learner)
 
 
-def random_tables(run: Run) -> tabular_runs.Tables:
+def random_tables(run: Run) -> learners.Tables:
     """In the middle of learning."""
-    tables, rng = tabular_runs.new_tables(STATES, run.learner.adaptive), np.random.default_rng(3)
+    tables, rng = learners.new_tables(STATES, run.learner.adaptive), np.random.default_rng(3)
     for table in (tables.logits, tables.value, tables.raw_value):
         table[:] = rng.standard_normal(table.shape)
     tables.policy[:] = np.exp(tables.logits) / np.exp(tables.logits).sum(-1, keepdims=True)
@@ -124,7 +124,7 @@ def sigmoid(value: float) -> float:
 class PlainStudent:
     """The tabular student in dictionaries and plain Python; of the compiled loop it shares only the order of draws."""
 
-    def __init__(self, run: Run, tables: tabular_runs.Tables | None = None) -> None:
+    def __init__(self, run: Run, tables: learners.Tables | None = None) -> None:
         self.run, self.spec = run, get_method(run.method)
         self.world = PlainWorld(run.world_index, run.world.end_prob)
         self.teacher = [np.log(softmax(values / 1.5)) for values in run.q]
@@ -224,7 +224,7 @@ class PlainStudent:
                 episode[name] += amount
         return list(episode.values())
 
-    def assert_same(self, tables: tabular_runs.Tables) -> None:
+    def assert_same(self, tables: learners.Tables) -> None:
         pairs = [("logits", self.logits), ("value", self.value), ("raw_value", self.raw_value)]
         for name, mine in [*pairs, ("weight_logit", self.weight_logit)]:
             expected = np.array([mine[state] for state in range(STATES)])

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("mujoco")
 from mujoco_cases import interrupt, run
 
-from recipes import checkpoints as module
-from recipes.checkpoints import Checkpoints
+from recipes.common import checkpoints as module
+from recipes.common.checkpoints import Checkpoints
 
 
 @pytest.fixture(scope="module")

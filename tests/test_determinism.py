@@ -25,7 +25,7 @@ def run_here(recipe: str, *arguments: str) -> None:
         patch.chdir(ROOT)
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
         patch.setattr(sys, "argv", [recipe, *arguments])
-        importlib.import_module(f"recipes.{recipe}").main()
+        importlib.import_module(f"recipes.{recipe}.__main__").main()
 
 
 def run_elsewhere(recipe: str, *arguments: str) -> None:

@@ -17,8 +17,8 @@ from omegaconf import OmegaConf
 from report_cases import write_run
 from tensordict import NonTensorData, TensorDict
 
-from recipes.report_runs import read
-from recipes.runs import refuse_foreign
+from recipes.common.run_folder import refuse_foreign
+from recipes.report.runs import read
 
 
 class Bomb:
@@ -84,10 +84,10 @@ def test_a_checkpoint_with_other_files_than_json_and_arrays_is_not_loaded(
 ) -> None:
     from mujoco_cases import config
 
-    from recipes.mujoco import train
-    from recipes.mujoco_config import check
-    from recipes.mujoco_run import supervise
-    from recipes.show_episode import load_agent
+    from recipes.mujoco.config import check
+    from recipes.mujoco.run import supervise
+    from recipes.mujoco.train import train
+    from recipes.show_weight.episode import load_agent
 
     spoil(received, tmp_path / "ran")
     with pytest.raises(ValueError, match="is not loaded: a checkpoint is a folder"):
@@ -100,7 +100,7 @@ def test_a_checkpoint_with_other_files_than_json_and_arrays_is_not_loaded(
 
 
 def test_a_checkpoint_of_ones_own_is_loaded(received: Path) -> None:
-    from recipes.show_episode import load_agent
+    from recipes.show_weight.episode import load_agent
 
     refuse_foreign(newest(received))
     assert load_agent(received, None)[1] == "Hopper-v5"
@@ -109,7 +109,7 @@ def test_a_checkpoint_of_ones_own_is_loaded(received: Path) -> None:
 def test_an_environment_that_names_a_module_is_not_shown(
     received: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from recipes.show_episode import load_agent
+    from recipes.show_weight.episode import load_agent
 
     (tmp_path / "foreign_module.py").write_text("raise AssertionError('it was imported')")
     monkeypatch.syspath_prepend(tmp_path)

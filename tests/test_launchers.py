@@ -13,8 +13,8 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.utils import instantiate
 
-import recipes.gridworld_config  # noqa: F401 (stores the schema)
-from recipes.launchers import cores
+import recipes.gridworld.config  # noqa: F401 (stores the schema)
+from recipes.common.sweeps import cores
 
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
 submitit = pytest.importorskip("submitit")
@@ -26,7 +26,7 @@ RECIPE = """
 import os
 import hydra
 from hydra.core.config_store import ConfigStore
-import recipes.launchers
+import recipes.common.sweeps
 
 ConfigStore.instance().store(
     name="nothing",

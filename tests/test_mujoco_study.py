@@ -19,9 +19,9 @@ from mujoco_cases import ROOT, TINY
 from omegaconf import OmegaConf
 
 from recipes import mujoco_study
-from recipes.mujoco import train
-from recipes.mujoco_config import check
-from recipes.mujoco_run import supervise
+from recipes.mujoco.config import check
+from recipes.mujoco.run import supervise
+from recipes.mujoco.train import train
 from recipes.mujoco_study import KEY, StudyRun, Tables, expand, study
 
 

@@ -14,8 +14,8 @@ pytest.importorskip("mujoco")
 from hydra import compose, initialize_config_dir
 from mujoco_cases import ROOT, interrupt, run
 
-from recipes.report_runs import find, name_groups, read, without_misfits
-from recipes.show_episode import load_agent
+from recipes.report.runs import find, name_groups, read, without_misfits
+from recipes.show_weight.episode import load_agent
 from torchrl_priors import Plateau, TeacherTrial
 
 SHORT = ["trial.max_frames=128", "trial.min_frames=64"]

@@ -15,10 +15,12 @@ import pytest
 pytest.importorskip("mujoco")
 from mujoco_cases import TINY, run
 
-from recipes import mujoco, mujoco_config, mujoco_run
-from recipes.launchers import start
-from recipes.progress import progress_bar
-from recipes.report_runs import find, read
+from recipes.common.progress import progress_bar
+from recipes.common.sweeps import start
+from recipes.mujoco import __main__ as mujoco
+from recipes.mujoco import config as mujoco_config
+from recipes.mujoco import run as mujoco_run
+from recipes.report.runs import find, read
 
 
 def stop_at(monkeypatch: pytest.MonkeyPatch, frames: int, how) -> None:

@@ -20,7 +20,11 @@ REQUIRED = {
     "gridworld": [],
     "mujoco": [],
 }
-MAINS = {name: importlib.import_module(f"recipes.{name}").main for name in REQUIRED}
+PACKAGES = {"report", "show_weight", "gridworld", "mujoco"}
+MAINS = {
+    name: importlib.import_module(f"recipes.{name}.__main__" if name in PACKAGES else f"recipes.{name}").main
+    for name in REQUIRED
+}
 Recipe = Callable[..., str]
 
 pytestmark = pytest.mark.usefixtures("without_torchrls_groups")

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import recipes.launchers  # noqa: F401  (hydra/launcher=cores)
-from recipes import gridworld_config, mujoco_config, report_config
+from recipes.gridworld import config as gridworld_config
+from recipes.mujoco import config as mujoco_config
+from recipes.report import config as report_config
 
 ROOT = Path(__file__).parents[1]
 CHECKS: dict[str, Callable[[Any], None]] = {

@@ -16,9 +16,10 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from recipes.gridworld import main, open_folder
-from recipes.tabular import LOG_FIELDS
-from recipes.tabular_runs import runs_of
+from recipes.gridworld.__main__ import main
+from recipes.gridworld.learners import runs_of
+from recipes.gridworld.study import open_folder
+from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors.methods import METHODS
 
 ROOT = Path(__file__).parents[1]

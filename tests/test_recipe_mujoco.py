@@ -19,8 +19,9 @@ from torch import nn
 from torchrl.modules import TanhNormal
 
 pytest.importorskip("mujoco")
-from recipes import mujoco, mujoco_agent
 from recipes.export_best import ExportConfig, export
+from recipes.mujoco import agent as agents
+from recipes.mujoco.__main__ import main
 from torchrl_priors import ModulePrior
 from torchrl_priors.artifacts import save_prior
 from torchrl_priors.methods import METHODS
@@ -60,18 +61,18 @@ def test_degraded_teachers_and_late_weights_run(options, teacher, tmp_path):
 def test_a_weight_trained_after_the_rollout_is_the_only_thing_trained_then(teacher, tmp_path):
     cfg = config(tmp_path, "method=ae2r", f"prior.path={teacher}", "weight.trained=rollout", "weight.lr_coeff=0")
     torch.manual_seed(0)
-    agent = mujoco_agent.Agent(cfg, "Hopper-v5", 11, 3)
+    agent = agents.Agent(cfg, "Hopper-v5", 11, 3)
     assert set(agent.networks()) == {"actor", "critic", "weight", "raw_critic"}
 
 
 def test_the_oracle_trusts_exactly_the_states_whose_advice_is_right(teacher, tmp_path):
     options = ["method=aligned", f"prior.path={teacher}", "weight.trained=oracle", "prior.threshold=0.1"]
     cfg = config(tmp_path, *options, "prior.degrade=structural")
-    agent = mujoco_agent.Agent(cfg, "Hopper-v5", 11, 3)
+    agent = agents.Agent(cfg, "Hopper-v5", 11, 3)
     assert set(agent.networks()) == {"actor", "critic"}
     states = TensorDict(observation=torch.randn(50, 11), batch_size=[50])
-    degraded = mujoco_agent.make_prior(cfg, "Hopper-v5", 11, 3).get_dist(states.copy()).mean
-    right = mujoco_agent.make_prior(config(tmp_path, *options), "Hopper-v5", 11, 3).get_dist(states.copy()).mean
+    degraded = agents.make_prior(cfg, "Hopper-v5", 11, 3).get_dist(states.copy()).mean
+    right = agents.make_prior(config(tmp_path, *options), "Hopper-v5", 11, 3).get_dist(states.copy()).mean
     trusted = agent.weight(states)["prior_weight"].squeeze(-1) == 1
     assert 0 < trusted.sum() < 50
     torch.testing.assert_close(degraded[trusted], right[trusted])
@@ -151,7 +152,7 @@ def test_a_schedule_that_is_not_used_is_no_part_of_a_runs_identity(teacher, tmp_
 
 
 def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
-    monkeypatch.setattr(mujoco_agent, "Agent", None)  # would fail if it were
+    monkeypatch.setattr(agents, "Agent", None)  # would fail if it were
     run(teacher.parent)
     assert "finished already" in capsys.readouterr().out
 
@@ -250,13 +251,13 @@ def test_a_missing_compiler_is_told_of_before_training(tmp_path, monkeypatch):
 
 
 def test_nan_losses_stop_the_run_and_keep_the_last_checkpoint(tmp_path, monkeypatch):
-    def broken(self, rollout, optimise=mujoco_agent.Optimiser.__call__, calls=[]):  # noqa: B006
+    def broken(self, rollout, optimise=agents.Optimiser.__call__, calls=[]):  # noqa: B006
         calls.append(None)
         losses = optimise(self, rollout)
         return losses | {"loss_objective": torch.tensor(float("nan"))} if len(calls) == 3 else losses
 
     with monkeypatch.context() as patch:
-        patch.setattr(mujoco_agent.Optimiser, "__call__", broken)
+        patch.setattr(agents.Optimiser, "__call__", broken)
         with pytest.raises(SystemExit, match="loss_objective became NaN") as error:
             run(tmp_path)
     assert "128" in str(error.value).rsplit("checkpoint", 1)[1]
@@ -277,7 +278,7 @@ def test_a_sweep_runs_every_combination_although_one_is_broken(tmp_path, monkeyp
     monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as end:
-        mujoco.main()
+        main()
     assert end.value.code == 1
     said = capfd.readouterr()
     assert "Sweep: 2 of 4 runs are done, 2 failed." in said.out

@@ -11,10 +11,11 @@ import pandas as pd
 import pytest
 from report_cases import POINTS, config, spoil, write_run, write_study
 
-from recipes.report import main, report
-from recipes.report_markdown import number, table
-from recipes.report_runs import find, name_groups, read, without_misfits
-from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
+from recipes.report.__main__ import main
+from recipes.report.markdown import number, table
+from recipes.report.page import report
+from recipes.report.runs import find, name_groups, read, without_misfits
+from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.metrics import iqm
 
 

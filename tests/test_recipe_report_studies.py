@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from report_cases import ROOT, config, spoil, write_run
 
-from recipes.report import report
+from recipes.report.page import report
 
 GRIDWORLD = ROOT / "results" / "gridworld" / "original"
 

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("hydra")
 from hydra import compose, initialize_config_dir
 
-from recipes.report import report
+from recipes.report.page import report
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.usefixtures("without_pictures")

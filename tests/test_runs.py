@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recipes.runs import RunFolder, digest
+from recipes.common.run_folder import RunFolder, digest
 
 CONFIG = {"worlds": 3, "student": {"lr": 0.1, "gamma": 0.95}, "methods": ["none", "er"]}
 NUMBERS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False])}
@@ -100,7 +100,7 @@ def test_a_folder_whose_first_file_only_was_written_is_continued(tmp_path, monke
 HOLDER = """
 import os, pickle, sys, time
 from pathlib import Path
-from recipes.runs import RunFolder
+from recipes.common.run_folder import RunFolder
 
 folder = RunFolder(Path(sys.argv[1]), {"worlds": 3}, "")
 copy = pickle.loads(pickle.dumps(folder))  # as for a worker

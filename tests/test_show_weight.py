@@ -11,8 +11,8 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 
-from recipes.gridworld import TaughtWorld, make_learner, run_world
-from recipes.show_weight import mean_over, show
+from recipes.gridworld.study import TaughtWorld, make_learner, run_world
+from recipes.show_weight.show import mean_over, show
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20"]
@@ -76,9 +76,9 @@ TINY += ["ppo.hidden=[8]", "evaluation.episodes=2", "compile=false"]
 def mujoco_run(tmp_path_factory) -> Path:
     """A run of AE2R with a teacher that is wrong in part of the states."""
     pytest.importorskip("mujoco")
-    from recipes.mujoco import train
-    from recipes.mujoco_config import check
-    from recipes.mujoco_run import supervise
+    from recipes.mujoco.config import check
+    from recipes.mujoco.run import supervise
+    from recipes.mujoco.train import train
 
     folder = tmp_path_factory.mktemp("mujoco")
     supervise(config("mujoco", *TINY, f"out={folder}/teacher"), check, train)
@@ -88,7 +88,7 @@ def mujoco_run(tmp_path_factory) -> Path:
 
 
 def test_an_episode_is_weighed_by_the_networks_of_the_checkpoint(mujoco_run, tmp_path):
-    from recipes.show_episode import load_agent, play, weigh
+    from recipes.show_weight.episode import load_agent, play, weigh
     from torchrl_priors.artifacts import load_policy
 
     agent, env_id = load_agent(mujoco_run, None)
@@ -110,7 +110,7 @@ def test_an_episode_is_weighed_by_the_networks_of_the_checkpoint(mujoco_run, tmp
 
 
 def test_another_teacher_is_refused(mujoco_run, tmp_path):
-    from recipes.show_episode import load_agent
+    from recipes.show_weight.episode import load_agent
 
     with pytest.raises(ValueError, match="is not the teacher of"):
         load_agent(mujoco_run, str(mujoco_run / "policy.safetensors"))

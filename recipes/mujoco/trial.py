@@ -8,8 +8,8 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from recipes.mujoco_agent import Student
-from recipes.mujoco_config import ALONE, MujocoConfig, teachers
+from recipes.mujoco.agent import Student
+from recipes.mujoco.config import ALONE, MujocoConfig, teachers
 from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 
 __all__ = ["Students", "arms"]

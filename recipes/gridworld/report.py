@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recipes.gridworld_config import GridworldConfig
-from recipes.runs import RunFolder
-from recipes.tabular import LOG_FIELDS
-from recipes.tabular_runs import runs_of
+from recipes.common.run_folder import RunFolder
+from recipes.gridworld.config import GridworldConfig
+from recipes.gridworld.learners import runs_of
+from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors import plots
 from torchrl_priors.envs import GridWorldEnv, GridWorlds
 from torchrl_priors.methods import get_method
@@ -27,7 +27,7 @@ from torchrl_priors.metrics import (
 
 __all__ = ["write"]
 
-_PAPER = Path(__file__).parent / "data" / "paper_area_ratio.csv"
+_PAPER = Path(__file__).with_name("paper_area_ratio.csv")
 #: Pairs of methods worth a direct comparison on the same worlds.
 _COMPARISONS = (
     ("aer", "er"),

@@ -1,9 +1,4 @@
-"""The tabular study: in each world a teacher, then every student with every prior; tables and figures of all of them.
-
-    python -m recipes.gridworld [study=paper|small|beyond|comparisons] [key=value ...]
-
-An interrupted run continues where it was; a finished one only reports again. See ``conf/gridworld.yaml`` for the keys.
-"""
+"""The tabular study: in each world a teacher, then every student with every prior."""
 
 from __future__ import annotations
 
@@ -14,17 +9,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import torch
 from omegaconf import OmegaConf
 
-from recipes import gridworld_report, tabular, tabular_runs
-from recipes.gridworld_config import GridworldConfig, check
-from recipes.launchers import fail, start
-from recipes.progress import progress_bar
-from recipes.runs import RunFolder, digest
-from recipes.schedule_config import applies, make_schedule, without_idle
+from recipes.common.progress import progress_bar
+from recipes.common.run_folder import RunFolder, digest
+from recipes.common.schedules import applies, make_schedule, without_idle
+from recipes.gridworld import learners as parts
+from recipes.gridworld import tabular
+from recipes.gridworld.config import GridworldConfig
 from torchrl_priors.envs import GridWorlds, sample_worlds
 
 #: What the results do not depend on.
@@ -46,13 +40,13 @@ def sample_world(cfg: GridworldConfig, seed: int) -> GridWorlds:
     return sample_worlds(torch.tensor([seed]), **{name: cfg.world[name] for name in names})  # type: ignore[index]
 
 
-def make_learner(cfg: GridworldConfig, method: str) -> tabular_runs.Learner:
+def make_learner(cfg: GridworldConfig, method: str) -> parts.Learner:
     """How the students of a method learn."""
     rates, budget = cfg.student.lr_weight, cfg.evaluation.points * cfg.evaluation.interval
     schedule = None
     if applies(cfg.schedule, method):
         schedule = make_schedule(cfg.schedule, budget)(torch.arange(budget + 1)).double().numpy()
-    return tabular_runs.learner_of(
+    return parts.learner_of(
         method,
         gamma=cfg.student.gamma,
         lr=cfg.student.lr,
@@ -76,19 +70,19 @@ class TaughtWorld:
     def __init__(self, cfg: GridworldConfig, seed: int) -> None:
         self.cfg, self.seed = cfg, seed
         self.grid = sample_world(cfg, seed)
-        self.world = tabular_runs.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
+        self.world = parts.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
         self.q, self.visited = self.teach()
 
     def teach(self) -> tuple[np.ndarray, np.ndarray]:
         """Action values of the teacher, ``[C, 4]``, and which states it visited, ``[C]``."""
         states, cfg = len(self.world.state), self.cfg.teacher
-        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), tabular_runs.generator(self.seed, "teacher")
+        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), parts.generator(self.seed, "teacher")
         tabular.teach(self.world, q, visited, cfg.steps, float(cfg.gamma), float(cfg.lr), float(cfg.epsilon), rng)
         return q, visited
 
     def facts(self) -> dict[str, Any]:
         """What ``worlds.csv`` says about the world and its teacher."""
-        rng = tabular_runs.generator(self.seed, "teacher evaluation")
+        rng = parts.generator(self.seed, "teacher evaluation")
         episodes = [tabular.teacher_episode(self.world, self.q, rng) for _ in range(self.cfg.teacher.eval_episodes)]
         total, length = np.mean(episodes, 0)
         return {
@@ -99,17 +93,17 @@ class TaughtWorld:
             "reachable_goal": bool(self.grid.has_goal()),
         }
 
-    def advice(self, prior: str) -> tabular_runs.Advice:
+    def advice(self, prior: str) -> parts.Advice:
         """What the prior of this name says."""
-        spec = tabular_runs.parse_prior(prior or "expert")
-        return tabular_runs.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
+        spec = parts.parse_prior(prior or "expert")
+        return parts.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
 
     def train(
         self,
         method: str,
         prior: str,
-        advice: tabular_runs.Advice,
-        learner: tabular_runs.Learner,
+        advice: parts.Advice,
+        learner: parts.Learner,
         *,
         watch: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -121,25 +115,25 @@ class TaughtWorld:
             self.world,
             advice,
             learner,
-            tabular_runs.new_tables(states, learner.adaptive),
+            parts.new_tables(states, learner.adaptive),
             self.cfg.evaluation.interval,
             log,
             weights,
             visits,
-            tabular_runs.generator(self.seed, "student", method, prior),
+            parts.generator(self.seed, "student", method, prior),
         )
         return log, weights, visits
 
 
 def run_world(
-    cfg: GridworldConfig, seed: int, learners: dict[str, tabular_runs.Learner], progress: Callable[[int], Any]
+    cfg: GridworldConfig, seed: int, learners: dict[str, parts.Learner], progress: Callable[[int], Any]
 ) -> dict[str, Any]:
     """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 8]``."""
     taught = TaughtWorld(cfg, seed)
     progress(cfg.teacher.steps)
     advice = {prior: taught.advice(prior) for prior in ("", *cfg.priors)}
     episodes = []
-    for method, prior in tabular_runs.runs_of(cfg.methods, cfg.priors):
+    for method, prior in parts.runs_of(cfg.methods, cfg.priors):
         episodes.append(taught.train(method, prior, advice[prior], learners[method])[0].astype(np.float32))
         progress(cfg.evaluation.points * cfg.evaluation.interval)
     return {**taught.facts(), "episodes": np.stack(episodes)}
@@ -148,7 +142,7 @@ def run_world(
 def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
     """What :func:`run_world` returns, stacked over worlds; blocks of worlds are kept in ``blocks/``."""
     learners = {method: make_learner(cfg, method) for method in cfg.methods}
-    pairs, budget = tabular_runs.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
+    pairs, budget = parts.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
     per_world = cfg.teacher.steps + len(pairs) * budget
     blocks = {
         f"blocks/{first:06d}": range(first, min(first + cfg.block_worlds, cfg.worlds))
@@ -178,20 +172,3 @@ def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
         finally:
             pool.shutdown(cancel_futures=True)
     return {what: np.concatenate([kept[name][what] for name in blocks]) for what in kept[next(iter(blocks))]}
-
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="gridworld")
-def main(cfg: GridworldConfig) -> str | None:
-    """Run or continue a study."""
-    try:
-        check(cfg)
-        folder = open_folder(cfg)
-        results = run_study(cfg, folder)
-        gridworld_report.write(cfg, folder, sample_world(cfg, cfg.seed), results)
-    except (ValueError, OSError) as error:
-        return fail(f"Error: {error}")
-    return None
-
-
-if __name__ == "__main__":
-    start(main)

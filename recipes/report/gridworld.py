@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
+from recipes.report.markdown import interval, pivot, plus_minus, table, write_text
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots import iqm_bars, learning_curves, method_label, prior_label, save_figure
 

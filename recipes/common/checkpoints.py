@@ -14,7 +14,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
-from recipes.runs import refuse_foreign
+from recipes.common.run_folder import refuse_foreign
 
 __all__ = ["Checkpoints"]
 

@@ -1,27 +1,19 @@
-"""What the prior weight of a run does: maps of it in a gridworld, or its course along an episode of MuJoCo.
-
-    python -m recipes.show_weight run=<folder> [key=value ...]
-
-See ``conf/show_weight.yaml`` for the keys.
-"""
+"""Which figures a run has of its prior weight; maps of the weight in a gridworld."""
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from recipes.checks import check_keys
-from recipes.gridworld import TaughtWorld, make_learner
-from recipes.launchers import start
-from recipes.report_runs import is_gridworld
-from recipes.tabular_runs import parse_prior
+from recipes.common.checks import check_keys
+from recipes.gridworld.learners import parse_prior
+from recipes.gridworld.study import TaughtWorld, make_learner
+from recipes.report.runs import is_gridworld
 from torchrl_priors import plots
 from torchrl_priors.methods import get_method
 
@@ -74,7 +66,7 @@ def show(cfg: ShowConfig) -> list[Path]:
     out = Path(cfg.out) if cfg.out else folder
     if is_gridworld(folder):
         return _show_gridworld(cfg, folder, out)
-    from recipes.show_episode import show_episode  # needs MuJoCo
+    from recipes.show_weight.episode import show_episode  # needs MuJoCo
 
     return show_episode(
         folder, out, seed=cfg.seed, steps=cfg.episode.steps, teacher=cfg.episode.teacher, video=cfg.episode.video
@@ -129,16 +121,3 @@ def mean_over(states: np.ndarray, weights: np.ndarray, visits: np.ndarray) -> np
     seen = (visits > 0) & states
     with np.errstate(invalid="ignore"):
         return np.where(seen, weights, 0.0).sum(-1) / seen.sum(-1)
-
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="show_weight")
-def main(cfg: ShowConfig) -> None:
-    """Show what a weight does."""
-    try:
-        print("Written:", *(f"  {path}" for path in show(cfg)), sep="\n")
-    except (ValueError, OSError, ImportError) as error:
-        sys.exit(f"Error: {error}")
-
-
-if __name__ == "__main__":
-    start(main)

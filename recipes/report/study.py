@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from recipes.mujoco_study import KEY
-from recipes.report_runs import LeftOut, Run
+from recipes.report.runs import LeftOut, Run
 from torchrl_priors.methods import METHODS
 
 __all__ = ["is_study", "read_study"]

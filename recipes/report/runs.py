@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 from omegaconf import OmegaConf
 
-from recipes.report_config import ReportConfig
-from recipes.runs import RunFolder
+from recipes.common.run_folder import RunFolder
+from recipes.report.config import ReportConfig
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
 __all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "short_paths", "without_misfits"]

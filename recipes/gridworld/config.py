@@ -8,9 +8,9 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import check_keys
-from recipes.schedule_config import ScheduleConfig, check_schedule
-from recipes.tabular_runs import parse_prior
+from recipes.common.checks import check_keys
+from recipes.common.schedules import ScheduleConfig, check_schedule
+from recipes.gridworld.learners import parse_prior
 from torchrl_priors.methods import get_method
 
 __all__ = ["GridworldConfig", "check"]

@@ -20,19 +20,19 @@ from omegaconf import OmegaConf
 from torch import Tensor
 from tqdm import tqdm
 
-from recipes.checkpoints import Checkpoints
-from recipes.launchers import fail, in_sweep
-from recipes.loggers import RunLogger
-from recipes.mujoco_config import MujocoConfig, teachers
-from recipes.progress import progress_bar
-from recipes.runs import RunFolder, digest, read_json
-from recipes.schedule_config import without_idle
+from recipes.common.checkpoints import Checkpoints
+from recipes.common.loggers import RunLogger
+from recipes.common.progress import progress_bar
+from recipes.common.run_folder import RunFolder, digest, read_json
+from recipes.common.schedules import without_idle
+from recipes.common.sweeps import fail, in_sweep
+from recipes.mujoco.config import MujocoConfig, teachers
 from torchrl_priors.artifacts import save_policy
 from torchrl_priors.collectors.evaluation import Evaluation
 from torchrl_priors.teacher_trial import TrialResult
 
 if TYPE_CHECKING:
-    from recipes.mujoco_trial import Students
+    from recipes.mujoco.trial import Students
 
 __all__ = ["Run", "TrainingError", "supervise"]
 

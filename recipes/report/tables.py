@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from recipes.report_config import ReportConfig
-from recipes.report_runs import Run
+from recipes.report.config import ReportConfig
+from recipes.report.runs import Run
 from torchrl_priors.methods import METHODS
 from torchrl_priors.metrics import (
     ConfidenceInterval,
@@ -23,7 +23,7 @@ from torchrl_priors.metrics import (
 __all__ = ["ALL", "Study", "dynamics_table", "improvement_table", "ratio_table", "return_table"]
 
 ALL = "all"
-_PAPER = Path(__file__).parent / "data" / "paper_training_metrics.csv"
+_PAPER = Path(__file__).with_name("paper_training_metrics.csv")
 
 
 class Study:

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recipes.report_runs import spec_of
-from recipes.report_tables import ALL, Study
+from recipes.report.runs import spec_of
+from recipes.report.tables import ALL, Study
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots.benchmark import interval_panels, profile_panels, return_curves
 

@@ -1,24 +1,17 @@
-"""PPO with an AVEC critic on MuJoCo, learning from a teacher by any of the methods.
-
-    python -m recipes.mujoco env=hopper method=ae2r prior.path=teacher.safetensors [key=value ...]
-
-A run keeps everything in one folder: ``eval.csv``, ``metrics.csv``, checkpoints and, at the end, the teacher that it
-makes, ``policy.safetensors``. An interrupted run continues with the same command; a finished one is not run again. See
-``conf/mujoco.yaml`` for the keys.
-"""
+"""The loop of a MuJoCo run."""
 
 from __future__ import annotations
 
 import time
 
-import hydra
 import torch
 
-from recipes.launchers import start
-from recipes.mujoco_config import MujocoConfig, check
-from recipes.mujoco_run import Run, supervise
-from recipes.mujoco_trial import Students
+from recipes.mujoco.config import MujocoConfig
+from recipes.mujoco.run import Run
+from recipes.mujoco.trial import Students
 from torchrl_priors.collectors import evaluate, make_vector_env
+
+__all__ = ["train"]
 
 
 def train(cfg: MujocoConfig, run: Run) -> None:
@@ -56,13 +49,3 @@ def train(cfg: MujocoConfig, run: Run) -> None:
         run.checkpoint_if_due(students.frames)
     agent = students.by_arm[students.chosen].agent
     run.finish(agent.actor, agent.normalizer, env_id, arm=students.chosen if students.several else None)
-
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="mujoco")
-def main(cfg: MujocoConfig) -> str | None:
-    """Train, or continue training, one agent."""
-    return supervise(cfg, check, train)
-
-
-if __name__ == "__main__":
-    start(main)

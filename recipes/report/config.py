@@ -8,7 +8,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.checks import check_keys
+from recipes.common.checks import check_keys
 
 __all__ = ["Bootstrap", "ReportConfig", "check"]
 

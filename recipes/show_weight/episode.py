@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from recipes.checkpoints import Checkpoints
-from recipes.mujoco_agent import Agent
-from recipes.mujoco_run import identity
+from recipes.common.checkpoints import Checkpoints
+from recipes.mujoco.agent import Agent
+from recipes.mujoco.run import identity
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
 from torchrl_priors.collectors import VectorCollector, make_vector_env
 from torchrl_priors.collectors.vector_env import spread_seed

@@ -1,10 +1,4 @@
-"""Report finished runs: tables (CSV), figures (PDF, PNG) and a page in Markdown.
-
-    python -m recipes.report runs=<folder, glob or list> [out=<folder>] [key=value ...]
-
-Runs are those of ``recipes.mujoco``, the table of a study of them, or studies of ``recipes.gridworld``. A run or study
-that isn't finished, or whose data have holes, is named and in no table. See ``conf/report.yaml`` for the keys.
-"""
+"""The pages of a report, from what :mod:`recipes.report.runs` finds."""
 
 from __future__ import annotations
 
@@ -13,21 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
 import pandas as pd
 from omegaconf import OmegaConf
 
-from recipes import report_gridworld
-from recipes.launchers import start
-from recipes.report_config import ReportConfig, check
-from recipes.report_figures import TRAINING, curve_table, figures
-from recipes.report_markdown import interval, pivot, plus_minus, table, write_text
-from recipes.report_runs import LeftOut, Run, find, is_gridworld, name_groups, read, short_paths, without_misfits
-from recipes.report_study import is_study, read_study
-from recipes.report_tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
+from recipes.report import gridworld
+from recipes.report.config import ReportConfig, check
+from recipes.report.figures import TRAINING, curve_table, figures
+from recipes.report.markdown import interval, pivot, plus_minus, table, write_text
+from recipes.report.runs import LeftOut, Run, find, is_gridworld, name_groups, read, short_paths, without_misfits
+from recipes.report.study import is_study, read_study
+from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.plots import save_figure
 
-__all__ = ["main", "report"]
+__all__ = ["report"]
 
 _CAPTIONS = {
     "return_curves": "Evaluation returns: interquartile mean over seeds",
@@ -54,12 +46,12 @@ def report(cfg: ReportConfig) -> Path:
     out = Path(cfg.out)
     studies = {folder.resolve(): folder for folder in folders if is_gridworld(folder)}
     if len(folders) == len(studies) == 1:
-        return report_gridworld.write(folders[0], out)
+        return gridworld.write(folders[0], out)
     usable, left_out = _usable(cfg, [folder for folder in folders if folder.resolve() not in studies])
     pages = []
     for path, name in sorted(short_paths(studies).items()):
         try:
-            pages.append(report_gridworld.write(studies[path], out / name))
+            pages.append(gridworld.write(studies[path], out / name))
         except ValueError as error:
             left_out.append(LeftOut(studies[path], str(error)))
     for entry in left_out:
@@ -207,16 +199,3 @@ def _dynamics(dynamics: pd.DataFrame) -> str:
 
 def _paper(mean: float, std: float) -> str:
     return f" [{mean:g} ± {std:g}]"
-
-
-@hydra.main(version_base="1.3", config_path="../conf", config_name="report")
-def main(cfg: ReportConfig) -> None:
-    """Write a report and say where it is."""
-    try:
-        print(f"Written: {report(cfg)}")
-    except (ValueError, OSError) as error:
-        sys.exit(f"Error: {error}")
-
-
-if __name__ == "__main__":
-    start(main)

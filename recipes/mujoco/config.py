@@ -14,10 +14,10 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 from tensordict import TensorDict
 
-import recipes.launchers  # noqa: F401  registers the launcher that conf/mujoco.yaml names
-from recipes.checks import check_keys, require_compiler
-from recipes.loggers import LOGGERS, require_logger
-from recipes.schedule_config import ScheduleConfig, check_schedule
+import recipes.common.sweeps  # noqa: F401  registers the launcher that conf/mujoco.yaml names
+from recipes.common.checks import check_keys, require_compiler
+from recipes.common.loggers import LOGGERS, require_logger
+from recipes.common.schedules import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env

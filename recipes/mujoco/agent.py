@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from recipes.mujoco_config import MujocoConfig, method_of
-from recipes.schedule_config import applies, make_schedule
+from recipes.common.schedules import applies, make_schedule
+from recipes.mujoco.config import MujocoConfig, method_of
 from torchrl_priors import (
     ActionPrior,
     AVECMixin,

@@ -1,0 +1,1 @@
+"""What recipes share: checks of a configuration, the folder of a run, sweeps."""

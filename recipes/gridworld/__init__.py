@@ -1,0 +1,1 @@
+"""The tabular study on random grid worlds: ``python -m recipes.gridworld``."""

@@ -1,0 +1,32 @@
+"""The tabular study: in each world a teacher, then every student with every prior; tables and figures of all of them.
+
+    python -m recipes.gridworld [study=paper|small|beyond|comparisons] [key=value ...]
+
+An interrupted run continues where it was; a finished one only reports again. See ``conf/gridworld.yaml`` for the keys.
+"""
+
+from __future__ import annotations
+
+import hydra
+
+from recipes.common.sweeps import fail, start
+from recipes.gridworld import report
+from recipes.gridworld.config import GridworldConfig, check
+from recipes.gridworld.study import open_folder, run_study, sample_world
+
+
+@hydra.main(version_base="1.3", config_path="../../conf", config_name="gridworld")
+def main(cfg: GridworldConfig) -> str | None:
+    """Run or continue a study."""
+    try:
+        check(cfg)
+        folder = open_folder(cfg)
+        results = run_study(cfg, folder)
+        report.write(cfg, folder, sample_world(cfg, cfg.seed), results)
+    except (ValueError, OSError) as error:
+        return fail(f"Error: {error}")
+    return None
+
+
+if __name__ == "__main__":
+    start(main)

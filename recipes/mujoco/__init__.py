@@ -1,0 +1,1 @@
+"""PPO on MuJoCo with a teacher: ``python -m recipes.mujoco``."""
