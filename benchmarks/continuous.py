@@ -34,8 +34,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import DoubleToFloat, GymEnv, SerialEnv, TransformedEnv
 
 from recipes.mujoco.agent import Agent, Optimiser
+from recipes.mujoco.task import open_task
 from torchrl_priors.artifacts import save_policy
-from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate, make_vector_env
+from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate
 from torchrl_priors.networks import make_actor
 
 
@@ -46,13 +47,16 @@ class Recipe:
         with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
             self.cfg = cfg = compose("mujoco", overrides=overrides)
         torch.manual_seed(0)
-        self.env_id = f"{cfg.env.id}-{cfg.env.version}"
-        env = make_vector_env(self.env_id, cfg.env.num_envs, **cfg.env.kwargs)
-        sizes = env.single_observation_space.shape[0], env.single_action_space.shape[0]
-        self.agent = agent = Agent(cfg, self.env_id, *sizes)
+        self.task = open_task(cfg)
+        self.env_id = self.task.env_id
+        self.agent = agent = Agent(cfg, self.task)
         self.optimise = Optimiser(agent)
         self.collector = VectorCollector(
-            env, agent.actor, frames_per_batch=cfg.env.frames_per_batch, normalizer=agent.normalizer, seed=0
+            self.task.make_env(cfg.env.num_envs),
+            agent.actor,
+            frames_per_batch=cfg.env.frames_per_batch,
+            normalizer=agent.normalizer,
+            seed=0,
         )
 
     def train(self, rollouts: int) -> None:
@@ -68,7 +72,7 @@ class Recipe:
     def evaluation_seconds(self) -> float:
         """Of one evaluation, which comes every ``evaluation.interval`` frames."""
         episodes = self.cfg.evaluation.episodes
-        env = make_vector_env(self.env_id, episodes, **self.cfg.env.kwargs)
+        env = self.task.make_env(episodes)
         start = time.perf_counter()
         evaluate(env, self.agent.actor, episodes=episodes, normalizer=self.agent.normalizer, seed=0)
         return time.perf_counter() - start

@@ -8,9 +8,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from recipes.mujoco.config import check
-from recipes.mujoco.run import Run, supervise
-from recipes.mujoco.train import train
+from recipes.mujoco import train
+from recipes.mujoco.run import Run
 
 ROOT = Path(__file__).parents[1]
 TINY = [
@@ -33,7 +32,7 @@ def config(out: Path, *overrides: str) -> DictConfig:
 
 
 def run(out: Path, *overrides: str) -> Path:
-    supervise(config(out, *overrides), check, train)
+    train.run(config(out, *overrides))
     return out
 
 

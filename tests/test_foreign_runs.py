@@ -84,9 +84,7 @@ def test_a_checkpoint_with_other_files_than_json_and_arrays_is_not_loaded(
 ) -> None:
     from mujoco_cases import config
 
-    from recipes.mujoco.config import check
-    from recipes.mujoco.run import supervise
-    from recipes.mujoco.train import train
+    from recipes.mujoco import train
     from recipes.show_weight.episode import load_agent
 
     spoil(received, tmp_path / "ran")
@@ -95,7 +93,7 @@ def test_a_checkpoint_with_other_files_than_json_and_arrays_is_not_loaded(
     (received / "status.json").unlink()
     teacher = OmegaConf.load(received / "config.yaml").prior.path
     with pytest.raises(SystemExit, match="is not loaded: a checkpoint is a folder"):
-        supervise(config(received, "method=ae2r", f"prior.path={teacher}"), check, train)
+        train.run(config(received, "method=ae2r", f"prior.path={teacher}"))
     assert not (tmp_path / "ran").exists()
 
 
@@ -103,7 +101,7 @@ def test_a_checkpoint_of_ones_own_is_loaded(received: Path) -> None:
     from recipes.show_weight.episode import load_agent
 
     refuse_foreign(newest(received))
-    assert load_agent(received, None)[1] == "Hopper-v5"
+    assert load_agent(received, None)[1].env_id == "Hopper-v5"
 
 
 def test_an_environment_that_names_a_module_is_not_shown(

@@ -19,9 +19,7 @@ from mujoco_cases import ROOT, TINY
 from omegaconf import OmegaConf
 
 from recipes import mujoco_study
-from recipes.mujoco.config import check
-from recipes.mujoco.run import supervise
-from recipes.mujoco.train import train
+from recipes.mujoco import train
 from recipes.mujoco_study import KEY, StudyRun, Tables, expand, study
 
 
@@ -43,7 +41,7 @@ class Here:
             cfg = compose("mujoco", overrides=[*run.overrides, f"out={run.folder}"])
         self.returncode = 0
         try:
-            supervise(cfg, check, train)
+            train.run(cfg)
         except SystemExit as error:
             run.folder.mkdir(parents=True)
             (run.folder / "log.txt").write_text(str(error))

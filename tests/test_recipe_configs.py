@@ -15,13 +15,13 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from recipes.gridworld import config as gridworld_config
-from recipes.mujoco import config as mujoco_config
+from recipes.mujoco import task
 from recipes.report import config as report_config
 
 ROOT = Path(__file__).parents[1]
 CHECKS: dict[str, Callable[[Any], None]] = {
     "gridworld": gridworld_config.check,
-    "mujoco": mujoco_config.check,
+    "mujoco": task.open_task,
     "report": report_config.check,
 }
 REQUIRED = {"report": ["runs=outputs"]}

@@ -22,6 +22,7 @@ pytest.importorskip("mujoco")
 from recipes.export_best import ExportConfig, export
 from recipes.mujoco import agent as agents
 from recipes.mujoco.__main__ import main
+from recipes.mujoco.task import open_task
 from torchrl_priors import ModulePrior
 from torchrl_priors.artifacts import save_prior
 from torchrl_priors.methods import METHODS
@@ -61,18 +62,19 @@ def test_degraded_teachers_and_late_weights_run(options, teacher, tmp_path):
 def test_a_weight_trained_after_the_rollout_is_the_only_thing_trained_then(teacher, tmp_path):
     cfg = config(tmp_path, "method=ae2r", f"prior.path={teacher}", "weight.trained=rollout", "weight.lr_coeff=0")
     torch.manual_seed(0)
-    agent = agents.Agent(cfg, "Hopper-v5", 11, 3)
+    agent = agents.Agent(cfg, open_task(cfg))
     assert set(agent.networks()) == {"actor", "critic", "weight", "raw_critic"}
 
 
 def test_the_oracle_trusts_exactly_the_states_whose_advice_is_right(teacher, tmp_path):
     options = ["method=aligned", f"prior.path={teacher}", "weight.trained=oracle", "prior.threshold=0.1"]
     cfg = config(tmp_path, *options, "prior.degrade=structural")
-    agent = agents.Agent(cfg, "Hopper-v5", 11, 3)
+    agent = agents.Agent(cfg, open_task(cfg))
     assert set(agent.networks()) == {"actor", "critic"}
     states = TensorDict(observation=torch.randn(50, 11), batch_size=[50])
-    degraded = agents.make_prior(cfg, "Hopper-v5", 11, 3).get_dist(states.copy()).mean
-    right = agents.make_prior(config(tmp_path, *options), "Hopper-v5", 11, 3).get_dist(states.copy()).mean
+    task = open_task(cfg)
+    degraded = agents.make_prior(cfg, task).get_dist(states.copy()).mean
+    right = task.teachers[str(teacher)].get_dist(states.copy()).mean
     trusted = agent.weight(states)["prior_weight"].squeeze(-1) == 1
     assert 0 < trusted.sum() < 50
     torch.testing.assert_close(degraded[trusted], right[trusted])

@@ -76,14 +76,12 @@ TINY += ["ppo.hidden=[8]", "evaluation.episodes=2", "compile=false"]
 def mujoco_run(tmp_path_factory) -> Path:
     """A run of AE2R with a teacher that is wrong in part of the states."""
     pytest.importorskip("mujoco")
-    from recipes.mujoco.config import check
-    from recipes.mujoco.run import supervise
-    from recipes.mujoco.train import train
+    from recipes.mujoco import train
 
     folder = tmp_path_factory.mktemp("mujoco")
-    supervise(config("mujoco", *TINY, f"out={folder}/teacher"), check, train)
+    train.run(config("mujoco", *TINY, f"out={folder}/teacher"))
     options = ["method=ae2r", f"prior.path={folder}/teacher/policy.safetensors", "prior.degrade=structural"]
-    supervise(config("mujoco", *TINY, f"out={folder}/run", *options), check, train)
+    train.run(config("mujoco", *TINY, f"out={folder}/run", *options))
     return folder / "run"
 
 

@@ -12,15 +12,14 @@ from __future__ import annotations
 import hydra
 
 from recipes.common.sweeps import start
-from recipes.mujoco.config import MujocoConfig, check
-from recipes.mujoco.run import supervise
-from recipes.mujoco.train import train
+from recipes.mujoco.config import MujocoConfig
+from recipes.mujoco.train import run
 
 
 @hydra.main(version_base="1.3", config_path="../../conf", config_name="mujoco")
 def main(cfg: MujocoConfig) -> str | None:
     """Train, or continue training, one agent."""
-    return supervise(cfg, check, train)
+    return run(cfg)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from recipes.common.schedules import applies, make_schedule
-from recipes.mujoco.config import MujocoConfig, method_of
+from recipes.mujoco.config import MujocoConfig, method_of, teachers
+from recipes.mujoco.task import Task
 from torchrl_priors import (
     ActionPrior,
     AVECMixin,
@@ -26,8 +27,7 @@ from torchrl_priors import (
     StructuralDegradation,
     ValueOffset,
 )
-from torchrl_priors.artifacts import load_prior
-from torchrl_priors.collectors import RunningNorm, VectorCollector, make_vector_env
+from torchrl_priors.collectors import RunningNorm, VectorCollector
 from torchrl_priors.networks import make_actor, make_critic, make_prior_weight
 from torchrl_priors.objectives import CompiledStep
 from torchrl_priors.plateau import Plateau
@@ -41,10 +41,9 @@ class AVECClipPPOPriorLoss(AVECMixin, ClipPPOPriorLoss):
     """The same with a prior."""
 
 
-def make_prior(cfg: MujocoConfig, env_id: str, obs_dim: int, act_dim: int) -> ActionPrior:
+def make_prior(cfg: MujocoConfig, task: Task) -> ActionPrior:
     """The teacher, degraded as the configuration says."""
-    assert cfg.prior.path is not None
-    prior: ActionPrior = load_prior(cfg.prior.path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
+    (prior,) = (task.teachers[str(file)] for file in teachers(cfg))
     if cfg.prior.degrade == "structural":
         feature, threshold = cfg.prior.feature, cfg.prior.threshold
         return StructuralDegradation(prior, lambda td: td["observation"][..., feature] > threshold)
@@ -81,9 +80,9 @@ def lets_go(cfg: MujocoConfig) -> bool:
 class Agent(nn.Module):
     """The networks of a run, its loss, and how a rollout is prepared for it."""
 
-    def __init__(self, cfg: MujocoConfig, env_id: str, obs_dim: int, act_dim: int) -> None:
+    def __init__(self, cfg: MujocoConfig, task: Task) -> None:
         super().__init__()
-        spec = method_of(cfg)
+        spec, obs_dim, act_dim = method_of(cfg), task.obs_dim, task.act_dim
         hidden = list(cfg.ppo.hidden)
         self.spec, self.cfg = spec, cfg
         self.normalizer = RunningNorm(obs_dim)
@@ -106,7 +105,7 @@ class Agent(nn.Module):
         if cfg.method == "none":
             self.loss: nn.Module = AVECClipPPOLoss(self.actor, self.critic, **ppo)
             return
-        prior = make_prior(cfg, env_id, obs_dim, act_dim)
+        prior = make_prior(cfg, task)
         if spec.adaptive:
             self.weight = make_weight(cfg, obs_dim)
             if not [*self.weight.parameters()]:
@@ -213,19 +212,18 @@ class Student:
     Several can take turns in one process: what each does is what it would do alone.
     """
 
-    def __init__(self, cfg: MujocoConfig, env_id: str) -> None:
+    def __init__(self, cfg: MujocoConfig, task: Task) -> None:
         torch.manual_seed(cfg.seed)
-        env = make_vector_env(env_id, cfg.env.num_envs, **cfg.env.kwargs)
-        self.agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
+        self.agent = Agent(cfg, task)
         self.optimise = Optimiser(self.agent)
         self.collector = VectorCollector(
-            env,
+            task.make_env(cfg.env.num_envs),
             self.agent.actor,
             frames_per_batch=cfg.env.frames_per_batch,
             normalizer=self.agent.normalizer,
             seed=cfg.seed,
         )
-        self.cfg, self.env_id = cfg, env_id
+        self.cfg, self.task = cfg, task
         self.coefficients = self.agent.coefficients()
         self.full = {name: float(module.get_buffer(buffer)) for name, (module, buffer) in self.coefficients.items()}
         self.schedulers: dict[str, CoeffScheduler] = {}
@@ -246,7 +244,7 @@ class Student:
 
     def twin(self) -> Student:
         """Another student in the same state."""
-        twin = Student(self.cfg, self.env_id)
+        twin = Student(self.cfg, self.task)
         for name, part in self.parts().items():
             twin.parts()[name].load_state_dict(deepcopy(part.state_dict()))
         twin.leaving = self.leaving

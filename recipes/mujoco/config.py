@@ -9,23 +9,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
-from tensordict import TensorDict
 
 import recipes.common.sweeps  # noqa: F401  registers the launcher that conf/mujoco.yaml names
 from recipes.common.checks import check_keys, require_compiler
 from recipes.common.loggers import LOGGERS, require_logger
 from recipes.common.schedules import ScheduleConfig, check_schedule
-from torchrl_priors.artifacts import ArtifactError, load_prior
-from torchrl_priors.collectors import make_vector_env
-from torchrl_priors.collectors.vector_env import check_vector_env
 from torchrl_priors.methods import MethodSpec, get_method
-from torchrl_priors.networks import make_actor
-from torchrl_priors.objectives import cross_entropy
 
-__all__ = ["ALONE", "MujocoConfig", "check", "method_of", "teachers"]
+__all__ = ["ALONE", "MujocoConfig", "check", "method_of", "require", "teachers"]
 
 ALONE = "alone"
 """The student of a trial that has no teacher."""
@@ -164,7 +157,12 @@ def method_of(cfg: MujocoConfig) -> MethodSpec:
     return spec if cfg.cross_entropy is None else replace(spec, cross_entropy=cfg.cross_entropy)  # type: ignore[arg-type]
 
 
-def _require(holds: bool, key: str, value: Any, expected: str) -> None:
+def require(holds: bool, key: str, value: Any, expected: str) -> None:
+    """Refuse the value of a key.
+
+    Raises:
+        ValueError: it does not hold; names the key, its value and what was expected.
+    """
     if not holds:
         raise ValueError(f"{key}={value}: expected {expected}.")
 
@@ -183,7 +181,7 @@ def check(cfg: MujocoConfig) -> None:
         _check_arms(cfg, files)
     elif cfg.method != "none":
         expected = "the file of a teacher" if not files else "one teacher; method=trial takes several"
-        _require(len(files) == 1, "prior.path", cfg.prior.path, f"{expected}, as method={cfg.method} has one")
+        require(len(files) == 1, "prior.path", cfg.prior.path, f"{expected}, as method={cfg.method} has one")
     if cfg.method == "trial" or cfg.let_go.methods == "all":
         _check_trial(cfg)
     options = {
@@ -196,10 +194,10 @@ def check(cfg: MujocoConfig) -> None:
         "logger": (cfg.logger, LOGGERS),
     }
     for key, (choice, allowed) in options.items():
-        _require(choice in allowed, key, choice, f"one of {', '.join(map(str, allowed))}")
+        require(choice in allowed, key, choice, f"one of {', '.join(map(str, allowed))}")
     check_schedule(cfg.schedule)
     if spec.relative:
-        _require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
+        require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
     positive = {
         "total_frames": cfg.total_frames,
         "env.num_envs": cfg.env.num_envs,
@@ -218,7 +216,7 @@ def check(cfg: MujocoConfig) -> None:
         "checkpoint.keep": cfg.checkpoint.keep,
     }
     for key, value in positive.items():
-        _require(0 < value < float("inf"), key, value, "a positive number")
+        require(0 < value < float("inf"), key, value, "a positive number")
     at_least_0 = {
         "seed": cfg.seed,
         "bonus_coeff": cfg.bonus_coeff,
@@ -227,97 +225,51 @@ def check(cfg: MujocoConfig) -> None:
         "ppo.entropy_coeff": cfg.ppo.entropy_coeff,
     }
     for key, value in at_least_0.items():
-        _require(0 <= value < float("inf"), key, value, "a number of at least 0")
-    _require(cfg.seed < 2**32, "seed", cfg.seed, "a number below 2**32")
+        require(0 <= value < float("inf"), key, value, "a number of at least 0")
+    require(cfg.seed < 2**32, "seed", cfg.seed, "a number below 2**32")
     finite = {"weight.init_bias": cfg.weight.init_bias, "prior.threshold": cfg.prior.threshold}
     for key, value in finite.items():
-        _require(math.isfinite(value), key, value, "a finite number")
+        require(math.isfinite(value), key, value, "a finite number")
     shares = {"ppo.gamma": cfg.ppo.gamma, "ppo.gae_lambda": cfg.ppo.gae_lambda, "prior.prob": cfg.prior.prob}
     for key, value in shares.items():
-        _require(0 <= value <= 1, key, value, "a number in [0, 1]")
-    _require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
+        require(0 <= value <= 1, key, value, "a number in [0, 1]")
+    require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
     if cfg.weight.trained == "oracle":
         degrade = cfg.prior.degrade
-        _require(
+        require(
             degrade == "structural", "prior.degrade", degrade, "structural, as weight.trained=oracle knows no other"
         )
     batch, frames = cfg.env.frames_per_batch, cfg.total_frames
     envs, size = cfg.env.num_envs, cfg.env.minibatch_size
-    _require(batch % envs == 0, "env.frames_per_batch", batch, f"a multiple of env.num_envs={envs}")
-    _require(batch % size == 0, "env.minibatch_size", size, f"a divisor of env.frames_per_batch={batch}")
+    require(batch % envs == 0, "env.frames_per_batch", batch, f"a multiple of env.num_envs={envs}")
+    require(batch % size == 0, "env.minibatch_size", size, f"a divisor of env.frames_per_batch={batch}")
     near = max(1, round(frames / batch)) * batch
     expected = f"a multiple of env.frames_per_batch={batch}, such as {near}"
-    _require(frames % batch == 0, "total_frames", frames, expected)
+    require(frames % batch == 0, "total_frames", frames, expected)
     require_logger(cfg.logger)
     if find_spec("safetensors") is None:  # found missing when the policy is saved, it would cost the run
         raise ImportError(
             "safetensors is missing, and the policy is saved by it: pip install 'torchrl-priors[recipes]'."
         )
     require_compiler(cfg.compile)
-    obs_dim, act_dim = _check_env(cfg)
-    for file in files if cfg.method != "none" else ():
-        _check_prior(cfg, file, obs_dim, act_dim)
-
-
-def _check_env(cfg: MujocoConfig) -> tuple[int, int]:
-    """Build one environment, so that a wrong name or argument is refused before there is a folder of the run.
-
-    Returns:
-        tuple of int: features of its observations, and dimensions of its actions.
-    """
-    name = f"{cfg.env.id}-{cfg.env.version}"
-    try:
-        env = make_vector_env(name, 1, **cfg.env.kwargs)
-        check_vector_env(env)
-        env.close()
-        return env.single_observation_space.shape[0], env.single_action_space.shape[0]
-    except Exception as error:  # Gymnasium's own, or whatever its environments raise
-        if (
-            isinstance(error, ImportError) and ":" not in name
-        ):  # MuJoCo is not installed; a:b is module a, environment b
-            raise
-        given = "".join(f", {key}={value}" for key, value in cfg.env.kwargs.items())
-        raise ValueError(f"env={name}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
 
 def _check_arms(cfg: MujocoConfig, files: Sequence[Path]) -> None:
     arms, method = len(files) + 1, cfg.trial.method
-    _require(bool(files), "prior.path", cfg.prior.path, "the files of one or more teachers, as method=trial tries them")
+    require(bool(files), "prior.path", cfg.prior.path, "the files of one or more teachers, as method=trial tries them")
     names = [file.stem for file in files]
-    _require(len({*names, ALONE}) == arms, "prior.path", cfg.prior.path, f"files of different names, none {ALONE!r}")
-    _require(method != "none", "trial.method", method, "a method with a teacher")
+    require(len({*names, ALONE}) == arms, "prior.path", cfg.prior.path, f"files of different names, none {ALONE!r}")
+    require(method != "none", "trial.method", method, "a method with a teacher")
     batch = cfg.env.frames_per_batch
     least = arms * (-(-cfg.trial.max_frames // batch)) * batch
     frames, expected = cfg.total_frames, f"at least {least}, for a trial of {arms} students"
-    _require(frames >= least, "total_frames", frames, expected)
+    require(frames >= least, "total_frames", frames, expected)
 
 
 def _check_trial(cfg: MujocoConfig) -> None:
     trial, batch = cfg.trial, cfg.env.frames_per_batch
     most = trial.max_frames
-    _require(most >= batch, "trial.max_frames", most, f"at least one rollout of {batch}")
-    _require(0 <= trial.min_frames <= most, "trial.min_frames", trial.min_frames, f"a number from 0 to {most}")
-    _require(0 < trial.alpha < 1, "trial.alpha", trial.alpha, "a number between 0 and 1")
-    _require(0 < trial.recent <= 1, "trial.recent", trial.recent, "a share above 0 and up to 1")
-
-
-def _check_prior(cfg: MujocoConfig, path: Path, obs_dim: int, act_dim: int) -> None:
-    """Read a teacher, so that a wrong one is refused before there is a folder of the run."""
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"prior.path={path}: {'a folder, expected a file' if path.is_dir() else 'no such file'}."
-        )
-    try:
-        env_id = f"{cfg.env.id}-{cfg.env.version}"
-        prior = load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
-    except ArtifactError as error:
-        raise ValueError(f"prior.path: {error}") from None
-    nothing = torch.zeros(1, obs_dim)
-    states = TensorDict(observation=nothing, observation_norm=nothing, batch_size=[1])
-    try:
-        cross_entropy(make_actor(obs_dim, act_dim).get_dist(states.copy()), prior.get_dist(states))
-    except (ValueError, NotImplementedError) as error:  # a teacher of bounded actions, say
-        raise ValueError(f"prior.path={path}: no student of this recipe can learn from it: {error}") from None
-    if cfg.prior.degrade == "structural":
-        last = obs_dim - 1
-        _require(0 <= cfg.prior.feature <= last, "prior.feature", cfg.prior.feature, f"a number from 0 to {last}")
+    require(most >= batch, "trial.max_frames", most, f"at least one rollout of {batch}")
+    require(0 <= trial.min_frames <= most, "trial.min_frames", trial.min_frames, f"a number from 0 to {most}")
+    require(0 < trial.alpha < 1, "trial.alpha", trial.alpha, "a number between 0 and 1")
+    require(0 < trial.recent <= 1, "trial.recent", trial.recent, "a share above 0 and up to 1")

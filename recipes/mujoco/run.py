@@ -8,14 +8,13 @@ import math
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
-import torch
 from omegaconf import OmegaConf
 from torch import Tensor
 from tqdm import tqdm
@@ -34,7 +33,7 @@ from torchrl_priors.teacher_trial import TrialResult
 if TYPE_CHECKING:
     from recipes.mujoco.trial import Students
 
-__all__ = ["Run", "TrainingError", "supervise"]
+__all__ = ["Run", "Supervisor", "TrainingError", "identity"]
 
 #: What the results do not depend on.
 _INCIDENTAL = ("out", "resume", "logger", "checkpoint")
@@ -89,10 +88,15 @@ class Run:
         text = json.dumps({"state": state, **more})
         self.folder.write("status.json", lambda path: path.write_text(text))
 
-    def register(self, students: Students) -> None:
-        """Who learns; loads their last checkpoint if the run is to be resumed, removes all checkpoints if not."""
+    @property
+    def is_finished(self) -> bool:
+        """Whether there is nothing left to do."""
+        status = self.status
+        return self.cfg.resume and status.get("state") == "finished" and status["frames"] >= self.cfg.total_frames
+
+    def begin(self, students: Students) -> None:
+        """Load the students' last checkpoint if the run is to be resumed, remove all checkpoints if not."""
         self.frames = 0
-        self.students = students
         if not self.cfg.resume:
             self.checkpoints.clear()
         elif self.checkpoints.load({"stage": students}, students.parts):
@@ -173,16 +177,17 @@ class Run:
             self.logger.scalars("eval", row)
         self._write_tables()
 
-    def checkpoint_if_due(self, frames: int) -> None:
-        """Save everything every ``checkpoint.interval`` frames, at the end, and when the process is to stop.
+    def checkpoint_if_due(self, students: Students) -> None:
+        """Save the students every ``checkpoint.interval`` frames, at the end, and when the process is to stop.
 
         Raises:
             Stopped: it is to stop.
         """
+        frames = students.frames
         if frames >= self.next_checkpoint or frames >= self.cfg.total_frames or self.is_to_stop:
             self.next_checkpoint = _next_multiple(frames, self.cfg.checkpoint.interval)
             self._write_tables()
-            self.checkpoints.save(self.students.parts(), frames)
+            self.checkpoints.save(students.parts(), frames)
             self.set_status("running", frames=frames)
         if self.is_to_stop and frames < self.cfg.total_frames:
             raise Stopped(f"{self.folder.path}: asked to stop (SIGTERM), saved at {frames} frames")
@@ -217,53 +222,44 @@ class Stopped(Exception):
     """The process was asked to end, and the run is saved."""
 
 
-def supervise(
-    cfg: MujocoConfig, check: Callable[[MujocoConfig], None], train: Callable[[MujocoConfig, Run], None]
-) -> str | None:
-    """Check, train, and leave a status whatever happens. The error, in a sweep, whose other runs go on."""
-    run = None
-    torch.set_num_threads(1)
-    try:
-        check(cfg)
-        opened = Run(cfg)
-        if opened.status.get("state") == "finished" and opened.status["frames"] >= cfg.total_frames and cfg.resume:
-            print(f"{opened.folder.path}: finished already", flush=True)
-            return None
-        run = opened  # from here on there is a status to write
-        with _sigterm(run):
-            train(cfg, run)
-    except (KeyboardInterrupt, Stopped) as reason:
-        what = "Interrupted" if isinstance(reason, KeyboardInterrupt) else str(reason)
-        if run is not None:
-            run.set_status("interrupted", frames=run.frames)
-        print(f"{what}: the same command continues.", file=sys.stderr, flush=True)
-        sys.exit(130 if isinstance(reason, KeyboardInterrupt) else 143)
-    except Exception as error:
-        if run is not None:
-            with suppress(OSError):  # a full disk, say
-                run.set_status("failed", frames=run.frames, error=str(error))
-        if not isinstance(error, (ValueError, OSError, ImportError, TrainingError)):
-            traceback.print_exc()
-        return fail(f"Error: {error}")
-    return None
+class Supervisor:
+    """Around a run: however it ends, its status says so, and the process ends as it should."""
 
+    run: Run | None = None
+    """The run, as soon as there is a status to write."""
+    error: str | None = None
+    """Why it failed, in a sweep, whose other runs go on."""
 
-@contextmanager
-def _sigterm(run: Run) -> Iterator[None]:
-    """What a cluster sends before it takes the machine away: the run is saved after the rollout at hand."""
+    def __enter__(self) -> Supervisor:
+        self._before: Any = None
+        with suppress(ValueError):  # not the main thread
+            self._before = signal.signal(signal.SIGTERM, self._stop)
+        return self
 
-    def stop(*_: Any) -> None:
-        run.is_to_stop = True
+    def _stop(self, *_: Any) -> None:
+        """What a cluster sends before it takes the machine away: the run is saved after the rollout at hand."""
+        if self.run is None:
+            sys.exit(143)
+        self.run.is_to_stop = True
 
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not the main thread
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback_: Any) -> bool:
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
+        if isinstance(error, (KeyboardInterrupt, Stopped)):
+            interrupted = isinstance(error, KeyboardInterrupt)
+            if self.run is not None:
+                self.run.set_status("interrupted", frames=self.run.frames)
+            said = "Interrupted" if interrupted else error
+            print(f"{said}: the same command continues.", file=sys.stderr, flush=True)
+            sys.exit(130 if interrupted else 143)
+        if isinstance(error, Exception):
+            if self.run is not None:
+                with suppress(OSError):  # a full disk, say
+                    self.run.set_status("failed", frames=self.run.frames, error=str(error))
+            if not isinstance(error, (ValueError, OSError, ImportError, TrainingError)):
+                traceback.print_exc()
+            self.error = fail(f"Error: {error}")
+        return self.error is not None
 
 
 def _next_multiple(frames: int, interval: int) -> int:

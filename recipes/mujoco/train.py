@@ -1,4 +1,4 @@
-"""The loop of a MuJoCo run."""
+"""A MuJoCo run from its configuration to its end."""
 
 from __future__ import annotations
 
@@ -7,19 +7,33 @@ import time
 import torch
 
 from recipes.mujoco.config import MujocoConfig
-from recipes.mujoco.run import Run
+from recipes.mujoco.run import Run, Supervisor
+from recipes.mujoco.task import Task, open_task
 from recipes.mujoco.trial import Students
-from torchrl_priors.collectors import evaluate, make_vector_env
+from torchrl_priors.collectors import evaluate
 
-__all__ = ["train"]
+__all__ = ["run", "train"]
 
 
-def train(cfg: MujocoConfig, run: Run) -> None:
+def run(cfg: MujocoConfig) -> str | None:
+    """Check, train, and leave a status whatever happens. The error, in a sweep, whose other runs go on."""
+    torch.set_num_threads(1)
+    with Supervisor() as supervisor:
+        task = open_task(cfg)
+        run = Run(cfg)
+        if run.is_finished:
+            print(f"{run.folder.path}: finished already", flush=True)
+        else:
+            supervisor.run = run
+            train(cfg, task, run)
+    return supervisor.error
+
+
+def train(cfg: MujocoConfig, task: Task, run: Run) -> None:
     """Train to the end, from the last checkpoint if there is one."""
-    env_id = f"{cfg.env.id}-{cfg.env.version}"
-    test_env = make_vector_env(env_id, cfg.evaluation.episodes, **cfg.env.kwargs)
-    students = Students(cfg, env_id)
-    run.register(students)
+    test_env = task.make_env(cfg.evaluation.episodes)
+    students = Students(cfg, task)
+    run.begin(students)
 
     def evaluate_policy() -> None:
         agent = students.by_arm[students.chosen].agent
@@ -46,6 +60,6 @@ def train(cfg: MujocoConfig, run: Run) -> None:
                 evaluate_policy()
         if len(students.results) > known:
             run.log_trials(students.results)
-        run.checkpoint_if_due(students.frames)
+        run.checkpoint_if_due(students)
     agent = students.by_arm[students.chosen].agent
-    run.finish(agent.actor, agent.normalizer, env_id, arm=students.chosen if students.several else None)
+    run.finish(agent.actor, agent.normalizer, task.env_id, arm=students.chosen if students.several else None)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from recipes.mujoco.agent import Student
 from recipes.mujoco.config import ALONE, MujocoConfig, teachers
+from recipes.mujoco.task import Task
 from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 
 __all__ = ["Students", "arms"]
@@ -40,9 +41,9 @@ class Students:
     student itself. If the teacher stays, the next such trial comes when the student has made twice as many frames.
     """
 
-    def __init__(self, cfg: MujocoConfig, env_id: str) -> None:
+    def __init__(self, cfg: MujocoConfig, task: Task) -> None:
         self.cfg = cfg
-        self.by_arm = {arm: Student(arm_cfg, env_id) for arm, arm_cfg in arms(cfg).items()}
+        self.by_arm = {arm: Student(arm_cfg, task) for arm, arm_cfg in arms(cfg).items()}
         self.chosen = next(iter(self.by_arm))
         """Whose policy is the run's: the last winner's; before there is one, that of the student alone."""
         self.trial = self._trial(list(self.by_arm)) if len(self.by_arm) > 1 else None
@@ -122,7 +123,7 @@ class Students:
         for arm, leaving in state_dict["leaving"].items():
             if arm not in self.by_arm:
                 kept = self.by_arm[arm.removesuffix(LET_GO)]
-                self.by_arm[arm] = Student(kept.cfg, kept.env_id)
+                self.by_arm[arm] = Student(kept.cfg, kept.task)
             self.by_arm[arm].leaving = leaving
         self._patience = int(state_dict["patience"])
         self.trial = None

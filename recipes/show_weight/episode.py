@@ -16,8 +16,9 @@ from torch import Tensor
 from recipes.common.checkpoints import Checkpoints
 from recipes.mujoco.agent import Agent
 from recipes.mujoco.run import identity
+from recipes.mujoco.task import Task, open_task
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
-from torchrl_priors.collectors import VectorCollector, make_vector_env
+from torchrl_priors.collectors import VectorCollector
 from torchrl_priors.collectors.vector_env import spread_seed
 from torchrl_priors.functional import td_residual
 from torchrl_priors.methods import get_method
@@ -26,7 +27,7 @@ from torchrl_priors.plots.video import write_weight_video
 __all__ = ["show_episode"]
 
 
-def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
+def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, Task]:
     """The agent of a run as its last checkpoint has it, and the name of its environment.
 
     A checkpoint holds every network and the normaliser as plain tensors: nothing else needs to be exported.
@@ -49,22 +50,20 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, str]:
     env_id = f"{cfg.env.id}-{cfg.env.version}"
     if ":" in env_id:  # Gymnasium would import what is before it
         raise ValueError(f"{folder} is a run of {env_id!r}: an environment that names a module to import is not shown.")
-    env = make_vector_env(env_id, 1, **cfg.env.kwargs)
-    agent = Agent(cfg, env_id, env.single_observation_space.shape[0], env.single_action_space.shape[0])
-    env.close()
+    task = open_task(cfg)
+    agent = Agent(cfg, task)
     known = identity(json.loads((folder / "config.json").read_text()))
     checkpoints = Checkpoints(folder / "checkpoints", cfg.checkpoint.keep, known)
     if not checkpoints.load({"agent": agent}, dict):
         raise ValueError(f"{folder} has no checkpoint.")
     agent.normalizer.freeze()
-    return agent, env_id
+    return agent, task
 
 
-def play(agent: Agent, env_id: str, seed: int, steps: int) -> TensorDictBase:
+def play(agent: Agent, task: Task, seed: int, steps: int) -> TensorDictBase:
     """The first steps of an episode of the stochastic policy, ``[T]``, scored under the teacher."""
-    env = make_vector_env(env_id, 1, **agent.cfg.env.kwargs)
     collector = VectorCollector(
-        env, agent.actor, frames_per_batch=steps, total_frames=-1, normalizer=agent.normalizer, seed=seed
+        task.make_env(1), agent.actor, frames_per_batch=steps, total_frames=-1, normalizer=agent.normalizer, seed=seed
     )
     torch.manual_seed(seed)  # what a degradation draws
     rollout = collector.rollout()
@@ -95,7 +94,7 @@ def weigh(agent: Agent, episode: TensorDictBase) -> dict[str, Tensor | None]:
     return {name: row.reshape(-1) for name, row in rows.items()} | {"degraded": degraded}
 
 
-def render(env_id: str, kwargs: Any, actions: np.ndarray, seed: int) -> tuple[list[np.ndarray], float]:
+def render(task: Task, actions: np.ndarray, seed: int) -> tuple[list[np.ndarray], float]:
     """Pictures of the episode, played once more, and how many there are a second.
 
     Raises:
@@ -104,7 +103,7 @@ def render(env_id: str, kwargs: Any, actions: np.ndarray, seed: int) -> tuple[li
     import gymnasium
 
     try:
-        env = gymnasium.make(env_id, render_mode="rgb_array", width=320, height=320, **kwargs)
+        env = gymnasium.make(task.env_id, render_mode="rgb_array", width=320, height=320, **task.kwargs)
         env.reset(seed=spread_seed(seed, 1, stream=0)[0][0])
         frames = []
         for action in actions:
@@ -130,13 +129,13 @@ def show_episode(
     """
     if steps < 1:
         raise ValueError(f"episode.steps={steps}: expected a positive number.")
-    agent, env_id = load_agent(folder, teacher)
-    episode = play(agent, env_id, seed, steps)
+    agent, task = load_agent(folder, teacher)
+    episode = play(agent, task, seed, steps)
     seen = weigh(agent, episode)
     figure = plots.episode_weights(**seen, method=agent.cfg.method)
     written = plots.save_figure(figure, out / f"weight_episode_{seed}")
     if video:
-        frames, rate = render(env_id, agent.cfg.env.kwargs, episode["action"].numpy(), seed)
+        frames, rate = render(task, episode["action"].numpy(), seed)
         written.append(
             write_weight_video(out / f"weight_episode_{seed}.gif", frames, seen["weight"], seen["degraded"], rate=rate)
         )
