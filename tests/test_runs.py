@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 from recipes.common.run_folder import RunFolder, digest
 
@@ -86,8 +87,8 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path, file, co
 def test_a_folder_whose_first_file_only_was_written_is_continued(tmp_path, monkeypatch):
     write = RunFolder.write
 
-    def killed(self, name, writer):
-        write(self, name, writer)
+    def killed(self, name, content):
+        write(self, name, content)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(RunFolder, "write", killed)
@@ -98,17 +99,13 @@ def test_a_folder_whose_first_file_only_was_written_is_continued(tmp_path, monke
 
 
 HOLDER = """
-import os, pickle, sys, time
+import subprocess, sys, time
 from pathlib import Path
 from recipes.common.run_folder import RunFolder
 
 folder = RunFolder(Path(sys.argv[1]), {"worlds": 3}, "")
-copy = pickle.loads(pickle.dumps(folder))  # as for a worker
-del copy
-child = os.fork()
-if not child:
-    time.sleep(600)
-print(child, flush=True)
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+print(child.pid, flush=True)
 time.sleep(600)
 """
 
@@ -137,11 +134,10 @@ def test_a_folder_is_one_processs_until_it_dies_whatever_becomes_of_its_children
 
 
 def test_a_file_system_without_locks_is_worked_on_without(tmp_path, monkeypatch):
-    def refuse(*args):
+    def refuse(*args, **kwargs):
         raise OSError(95, "Operation not supported")
 
-    fcntl = pytest.importorskip("fcntl")
-    monkeypatch.setattr(fcntl, "lockf", refuse)
+    monkeypatch.setattr(FileLock, "acquire", refuse)
     assert RunFolder(tmp_path, CONFIG, "").config == CONFIG
 
 
@@ -153,17 +149,17 @@ def test_file_in_the_way_is_named_and_stays(tmp_path):
     assert (tmp_path / "out").read_text() == "precious"
 
 
-def test_write_that_fails_leaves_the_old_file_and_no_other(tmp_path):
+def test_write_that_fails_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     folder = RunFolder(tmp_path, CONFIG, "")
-    folder.write("table.csv", lambda path: path.write_text("old"))
+    folder.write("table.csv", "old")
     before = contents(tmp_path)
 
-    def fail(path: Path) -> None:
-        path.write_text("half of the ne")
-        raise RuntimeError("out of luck")
+    def fail(*args):
+        raise OSError(28, "No space left on device")
 
-    with pytest.raises(RuntimeError, match="out of luck"):
-        folder.write("table.csv", fail)
+    monkeypatch.setattr(os, "replace", fail)  # by then the new one is written
+    with pytest.raises(OSError, match="No space"):
+        folder.write("table.csv", "new")
     assert contents(tmp_path) == before
 
 
@@ -171,7 +167,7 @@ def test_what_a_killed_process_was_writing_is_removed_when_it_is_continued(tmp_p
     RunFolder(tmp_path, CONFIG, "").arrays("blocks/0", lambda: NUMBERS)
     before = contents(tmp_path)
     (tmp_path / "checkpoints").mkdir()
-    for name in (".12.eval.csv", "blocks/.12.1.npz", ".policy.safetensors.0a1b2c3d.partial"):
+    for name in (".eval.csv.12.partial", "blocks/.1.npz.12.partial", ".policy.safetensors.0a1b2c3d.partial"):
         (tmp_path / name).write_text("half")
     (tmp_path / "checkpoints" / ".checkpoint-000000000064.stage-0a").mkdir()
     (tmp_path / ".hidden").write_text("somebody's")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import re
 import shutil
 import sys
@@ -14,7 +12,7 @@ from typing import Any
 
 from torchrl.checkpoint import Checkpoint, CheckpointRotation
 
-from recipes.common.run_folder import refuse_foreign
+from recipes.common.run_folder import refuse_foreign, sha256, write_file
 
 __all__ = ["Checkpoints"]
 
@@ -51,8 +49,8 @@ class Checkpoints:
                 f" {max(1, needed // 2**20)} MB for a moment twice. Make room: the same command continues."
             )
         path = self._rotation.save(Checkpoint(**parts), step=frames)
-        seal = {"run": self.identity, "files": {name: _digest(path / name) for name in _files(path)}}
-        _write_synced(_seal(path), json.dumps(seal).encode())
+        seal = {"run": self.identity, "files": {name: sha256(path / name) for name in _files(path)}}
+        write_file(_seal(path), json.dumps(seal))
         self._pruned.prune()
         for old in self.folder.glob("*.sha256.json"):
             if not old.with_name(old.name.removesuffix(".sha256.json")).exists():
@@ -117,7 +115,7 @@ class Checkpoints:
         if different := sorted(set(there) ^ set(files)):
             return f"{path / different[0]} is {'missing' if different[0] in files else 'not of this checkpoint'}"
         for name in there:
-            if _digest(path / name) != files[name]:
+            if sha256(path / name) != files[name]:
                 return f"{path / name} is damaged"
         return None
 
@@ -134,17 +132,3 @@ def _files(path: Path) -> list[str]:
 
 def _size(path: Path) -> int:
     return sum(file.lstat().st_size for file in path.rglob("*") if not file.is_dir()) if path.is_dir() else 0
-
-
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
-
-
-def _write_synced(file: Path, content: bytes) -> None:
-    """Whole or not at all, and on the disk when this returns."""
-    temporary = file.with_name(f".{os.getpid()}.{file.name}")
-    with temporary.open("wb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(file)

@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
-import os
 import shutil
-import sys
-import weakref
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
-if sys.platform != "win32":
-    import fcntl
+from torchrl_priors.artifacts.format import write_atomically
 
-__all__ = ["RunFolder", "digest", "read_json", "refuse_foreign"]
+__all__ = ["RunFolder", "digest", "flatten", "read_json", "refuse_foreign", "sha256", "write_file"]
 
-#: Temporary names: of :meth:`RunFolder.write`, of policies, and of TorchRL's checkpoints (being written or removed).
-_LEFTOVERS = (".[0-9]*.*", "*/.[0-9]*.*", ".*.partial", "checkpoints/.checkpoint-*")
+#: Temporary names: of the atomic writer, and of TorchRL's checkpoints (being written or removed).
+_LEFTOVERS = (".*.partial", "*/.*.partial", "checkpoints/.checkpoint-*")
 
 
 def digest(config: dict[str, Any]) -> str:
     """Eight characters that tell two configurations apart."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def sha256(file: Path) -> str:
+    """The digest of a file's content."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def refuse_foreign(checkpoint: Path) -> None:
@@ -59,18 +62,26 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A configuration as ``{"a.b": value}``."""
     flat: dict[str, Any] = {}
     for name, value in config.items():
-        flat.update(_flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
+        flat.update(flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value})
     return flat
+
+
+def write_file(file: Path, content: str | bytes) -> Path:
+    """Write a file, in folders that are made if needed, that is either whole or as it was before."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, content.encode() if isinstance(content, str) else content)
+    return file
 
 
 class RunFolder:
     """A folder for the results of one configuration, to be continued by the same configuration only.
 
-    While the object lives, other processes are kept out of the folder. Neither a child process nor a copy sent to one
-    holds the lock, and it ends with the process, however that does.
+    While the object lives, other processes are kept out of the folder. The lock ends with the process, however that
+    does.
 
     Args:
         path (Path): created if needed.
@@ -95,19 +106,17 @@ class RunFolder:
                 self._check_same(read_json(stamp), config, may_grow)
             elif (path / "config.yaml").exists():
                 raise ValueError(f"out={path} holds a config.yaml that is not of this recipe: choose another folder.")
-            self._lock()
+            self._keep_others_out()
             if known:
                 self._remove_leftovers()
             # first what makes the folder this recipe's: it may be killed in between
-            self.write(
-                "config.json", lambda temporary: temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
-            )
-            self.write("config.yaml", lambda temporary: temporary.write_text(text))
+            self.write("config.json", json.dumps(config, indent=1, sort_keys=True))
+            self.write("config.yaml", text)
         except OSError as error:
             raise OSError(f"Cannot write the results to out={path}: {error}") from error
 
     def _check_same(self, theirs: dict[str, Any], ours: dict[str, Any], may_grow: Sequence[str]) -> None:
-        before, now = _flatten(theirs), _flatten(ours)
+        before, now = flatten(theirs), flatten(ours)
         changed = [
             f"{name}: {before.get(name, 'absent')} -> {now.get(name, 'absent')}"
             for name in sorted(before.keys() | now.keys())
@@ -120,34 +129,33 @@ class RunFolder:
                 "folder, or leave `out` to its default, which differs for each configuration."
             )
 
-    def _lock(self) -> None:
-        if sys.platform == "win32":
-            return
-        descriptor = os.open(self.path / ".lock", os.O_RDWR | os.O_CREAT, 0o666)  # never deleted: one file for all
-        weakref.finalize(self, os.close, descriptor)
+    def _keep_others_out(self) -> None:
+        self._lock = FileLock(self.path / ".lock")
         try:
-            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)  # unlike flock's, not inherited by children
-        except (BlockingIOError, PermissionError):
+            self._lock.acquire(blocking=False)
+        except Timeout:
             raise ValueError(
                 f"out={self.path}: another process is at work in this folder. Wait for it, end it, or choose another."
             ) from None
-        except OSError:
+        except (NotImplementedError, OSError):
             pass  # a file system without locks
+
+    def release(self) -> None:
+        """Let others work in the folder."""
+        self._lock.release()
 
     @staticmethod
     def is_at_work(path: Path) -> bool:
-        """Whether a process other than this one is at work in a folder; where that can't be told, True."""
+        """Whether a process is at work in a folder; False where that can't be told."""
+        if not (path / ".lock").exists():
+            return False
         try:
-            descriptor = os.open(path / ".lock", os.O_RDWR)
-        except OSError:
-            return sys.platform == "win32"
-        try:
-            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            with FileLock(path / ".lock", blocking=False):
+                return False
+        except Timeout:
             return True
-        finally:
-            os.close(descriptor)
-        return False
+        except (NotImplementedError, OSError):
+            return False
 
     def _remove_leftovers(self) -> None:
         """Remove what was being written when the process was killed."""
@@ -158,17 +166,9 @@ class RunFolder:
                 else:
                     path.unlink(missing_ok=True)
 
-    def write(self, name: str, writer: Callable[[Path], Any]) -> Path:
-        """Have ``writer`` fill a temporary file, then put it in place in one step."""
-        target = self.path / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{os.getpid()}.{target.name}")
-        try:
-            writer(temporary)
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
-        return target
+    def write(self, name: str, content: str | bytes) -> Path:
+        """Write a file that is either whole or as it was before."""
+        return write_file(self.path / name, content)
 
     def has(self, name: str) -> bool:
         """Whether the arrays ``<name>.npz`` are there."""
@@ -183,11 +183,7 @@ class RunFolder:
                     return dict(stored)
             except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
                 raise ValueError(f"{path} is damaged ({error}): delete it to have it computed again.") from error
-        arrays = compute()
-
-        def save(temporary: Path) -> None:
-            with temporary.open("wb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]
-
-        self.write(f"{name}.npz", save)
+        arrays, stream = compute(), io.BytesIO()
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
+        self.write(f"{name}.npz", stream.getvalue())
         return arrays

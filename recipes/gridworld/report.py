@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -203,7 +202,7 @@ def write(cfg: GridworldConfig, folder: RunFolder, world: GridWorlds, results: d
         "curves": curve_table(cfg, curves),
     }
     written = [
-        folder.write(f"{name}.csv", partial(table.to_csv, index=False, float_format="%.6g"))
+        folder.write(f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
         for name, table in tables.items()
         if len(table)
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import signal
@@ -10,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +20,7 @@ from tqdm import tqdm
 from recipes.common.checkpoints import Checkpoints
 from recipes.common.loggers import RunLogger
 from recipes.common.progress import progress_bar
-from recipes.common.run_folder import RunFolder, digest, read_json
+from recipes.common.run_folder import RunFolder, digest, read_json, sha256
 from recipes.common.schedules import without_idle
 from recipes.common.sweeps import fail, in_sweep
 from recipes.mujoco.config import MujocoConfig, teachers
@@ -62,7 +60,7 @@ class Run:
         matters = {key: value for key, value in matters.items() if key not in idle}
         matters = without_idle(matters, cfg.schedule, [cfg.trial.method if cfg.method == "trial" else cfg.method])
         if files := teachers(cfg):
-            names, digests = [file.name for file in files], [_sha256(file) for file in files]
+            names, digests = [file.name for file in files], [sha256(file) for file in files]
             one = isinstance(cfg.prior.path, str)
             matters["prior"] |= {"path": names[0] if one else names, "sha256": digests[0] if one else digests}
         env = f"{cfg.env.id}-{cfg.env.version}"
@@ -85,8 +83,7 @@ class Run:
 
     def set_status(self, state: str, **more: Any) -> None:
         """Write ``status.json``."""
-        text = json.dumps({"state": state, **more})
-        self.folder.write("status.json", lambda path: path.write_text(text))
+        self.folder.write("status.json", json.dumps({"state": state, **more}))
 
     @property
     def is_finished(self) -> bool:
@@ -146,8 +143,7 @@ class Run:
 
     def log_trials(self, results: Sequence[TrialResult]) -> None:
         """Keep who won the trials so far, and say who won the last."""
-        text = json.dumps([result._asdict() for result in results], indent=1)
-        self.folder.write("trials.json", lambda path: path.write_text(text))
+        self.folder.write("trials.json", json.dumps([result._asdict() for result in results], indent=1))
         tqdm.write(f"{self.folder.path}: {results[-1]}", file=sys.stderr)
 
     def evaluation_is_due(self, frames: int) -> bool:
@@ -214,8 +210,7 @@ class Run:
 
     def _write_tables(self) -> None:
         for name, rows in (("eval", self.evaluations), ("metrics", self.metrics)):
-            table = pd.DataFrame(rows)
-            self.folder.write(f"{name}.csv", partial(table.to_csv, index=False))
+            self.folder.write(f"{name}.csv", pd.DataFrame(rows).to_csv(index=False))
 
 
 class Stopped(Exception):
@@ -247,19 +242,23 @@ class Supervisor:
             signal.signal(signal.SIGTERM, self._before)
         if isinstance(error, (KeyboardInterrupt, Stopped)):
             interrupted = isinstance(error, KeyboardInterrupt)
-            if self.run is not None:
-                self.run.set_status("interrupted", frames=self.run.frames)
+            self._end("interrupted")
             said = "Interrupted" if interrupted else error
             print(f"{said}: the same command continues.", file=sys.stderr, flush=True)
             sys.exit(130 if interrupted else 143)
         if isinstance(error, Exception):
-            if self.run is not None:
-                with suppress(OSError):  # a full disk, say
-                    self.run.set_status("failed", frames=self.run.frames, error=str(error))
+            self._end("failed", error=str(error))
             if not isinstance(error, (ValueError, OSError, ImportError, TrainingError)):
                 traceback.print_exc()
             self.error = fail(f"Error: {error}")
         return self.error is not None
+
+    def _end(self, state: str, **more: Any) -> None:
+        """The run's last words."""
+        if self.run is not None:
+            with suppress(OSError):  # a full disk, say
+                self.run.set_status(state, frames=self.run.frames, **more)
+            self.run.folder.release()
 
 
 def _next_multiple(frames: int, interval: int) -> int:
@@ -271,7 +270,3 @@ def _rows_until(path: Path, frames: int) -> list[dict[str, Any]]:
         return []
     rows = pd.read_csv(path, float_precision="round_trip").to_dict("records")
     return [row for row in rows if row["frames"] <= frames]
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -10,7 +10,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
-from recipes.report.markdown import interval, pivot, plus_minus, table, write_text
+from recipes.common.run_folder import write_file
+from recipes.report.markdown import interval, pivot, plus_minus, table
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots import iqm_bars, learning_curves, method_label, prior_label, save_figure
 
@@ -34,7 +35,7 @@ def write(folder: Path, out: Path) -> Path:
     for name in _TAKEN:
         if (folder / name).exists() and folder.resolve() != out.resolve():
             shutil.copyfile(folder / name, out / name)
-    return write_text(out / "report.md", _page(folder, out, config, tables))
+    return write_file(out / "report.md", _page(folder, out, config, tables))
 
 
 def _config(file: Path) -> dict[str, Any]:

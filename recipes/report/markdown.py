@@ -1,31 +1,13 @@
-"""Tables in Markdown, and the page that holds a report together."""
+"""Numbers and tables in Markdown."""
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-__all__ = ["interval", "number", "pivot", "plus_minus", "table", "write_text"]
-
-
-def write_text(file: Path, text: str) -> Path:
-    """Write a file that is either whole or as it was before."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(file)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    return file
+__all__ = ["interval", "number", "pivot", "plus_minus", "table"]
 
 
 def number(value: float, digits: int = 2) -> str:

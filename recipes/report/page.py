@@ -10,10 +10,11 @@ from typing import Any
 import pandas as pd
 from omegaconf import OmegaConf
 
+from recipes.common.run_folder import write_file
 from recipes.report import gridworld
 from recipes.report.config import ReportConfig, check
 from recipes.report.figures import TRAINING, curve_table, figures
-from recipes.report.markdown import interval, pivot, plus_minus, table, write_text
+from recipes.report.markdown import interval, pivot, plus_minus, table
 from recipes.report.runs import LeftOut, Run, find, is_gridworld, name_groups, read, short_paths, without_misfits
 from recipes.report.study import is_study, read_study
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
@@ -77,7 +78,7 @@ def _index(out: Path, pages: Sequence[Path], left_out: Sequence[LeftOut]) -> Pat
     links = [page.relative_to(out) for page in pages]
     parts = ["# Reports", "\n".join(f"- [{link.parent if link.parent.name else 'runs'}]({link})" for link in links)]
     parts += _left_out(left_out)
-    return write_text(out / "README.md", "\n\n".join(parts) + "\n")
+    return write_file(out / "README.md", "\n\n".join(parts) + "\n")
 
 
 def _left_out(entries: Sequence[LeftOut]) -> list[str]:
@@ -102,13 +103,13 @@ def _report_runs(
     }
     pictures = figures(study, tables["curves"], tables["area_ratio"], tables["improvement"])
     for name, content in tables.items():
-        write_text(out / f"{name}.csv", content.to_csv(index=False, float_format="%.6g"))
+        write_file(out / f"{name}.csv", content.to_csv(index=False, float_format="%.6g"))
     for name, figure in pictures.items():
         save_figure(figure, out / name)
     used = pd.DataFrame([(run.env, run.prior, run.label, run.seed) for run in usable])
     used.columns = ["env", "prior", "method", "seed"]
     page = _page(study, given, used, tables, left_out, list(pictures))
-    return write_text(out / "report.md", page)
+    return write_file(out / "report.md", page)
 
 
 def _page(

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from omegaconf import OmegaConf
 
-from recipes.common.run_folder import RunFolder
+from recipes.common.run_folder import RunFolder, flatten
 from recipes.report.config import ReportConfig
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
@@ -126,7 +126,7 @@ def _read_whole(folder: Path) -> Run:
         degrade="" if method == "none" else str((config.get("prior") or {}).get("degrade") or "none"),
         method=method,
         seed=seed,
-        settings=_flatten(config),
+        settings=flatten(config),
         evaluations=_table(folder / "eval.csv", ["frames", "mean_return"], optional=()),
         metrics=_table(folder / "metrics.csv", needed, optional=("episode*", "aux_coeff", "bonus_coeff"), arm=arm),
     )
@@ -192,13 +192,6 @@ def spec_of(method: str, settings: Mapping[str, Any]) -> MethodSpec:
     """The settings of a run's method, or of that which its trial tries."""
     tried = settings.get("trial.method") or (settings.get("trial") or {}).get("method", "none")
     return get_method(str(tried) if method == "trial" else method)
-
-
-def _flatten(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in config.items():
-        flat.update(_flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value})
-    return flat
 
 
 def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from recipes.common.checkpoints import Checkpoints
+from recipes.common.run_folder import sha256
 from recipes.mujoco.agent import Agent
 from recipes.mujoco.run import identity
 from recipes.mujoco.task import Task, open_task
@@ -45,7 +45,7 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, Task]:
     path = Path(cfg.prior.path)
     if not path.is_file():
         raise ValueError(f"The run's teacher {path} is not there: say where it is by episode.teacher=<file>.")
-    if sha256(path.read_bytes()).hexdigest() != expected:
+    if sha256(path) != expected:
         raise ValueError(f"{path} is not the teacher of {folder}: its content is another one.")
     env_id = f"{cfg.env.id}-{cfg.env.version}"
     if ":" in env_id:  # Gymnasium would import what is before it
