@@ -1,38 +1,102 @@
-"""What recipes check before they work: their keys, the file to write, and a C++ compiler where one is needed."""
+"""What recipes check before they work: keys and their values, the file to write, a C++ compiler."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import Field, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import MISSING, OmegaConf
 
-__all__ = ["check_keys", "require_compiler", "require_file_name"]
+__all__ = [
+    "at_least_0",
+    "check_keys",
+    "finite",
+    "one_of",
+    "positive",
+    "require",
+    "require_compiler",
+    "require_file_name",
+    "share",
+]
+
+
+def _expect(expected: str, holds: Callable[[Any], bool]) -> Any:
+    return field(default=MISSING, metadata={"expected": expected, "holds": holds})
+
+
+def positive(below: float = math.inf) -> Any:
+    """An entry of a schema: a number above 0."""
+    return _expect("a positive number" + _below(below), lambda value: 0 < value < below)
+
+
+def at_least_0(below: float = math.inf) -> Any:
+    """An entry of a schema: a number that is not negative."""
+    return _expect("a number of at least 0" + _below(below), lambda value: 0 <= value < below)
+
+
+def _below(limit: float) -> str:
+    return "" if limit == math.inf else f", below 2**{math.log2(limit):g}"
+
+
+def finite() -> Any:
+    """An entry of a schema: a number that is finite."""
+    return _expect("a finite number", math.isfinite)
+
+
+def share() -> Any:
+    """An entry of a schema: a number from 0 to 1."""
+    return _expect("a number in [0, 1]", lambda value: 0 <= value <= 1)
+
+
+def one_of(*choices: str) -> Any:
+    """An entry of a schema: one of some words (or null, where its type allows that)."""
+    return _expect(f"one of {', '.join(choices)}", lambda value: value in choices)
+
+
+def require(holds: bool, key: str, value: Any, expected: str) -> None:
+    """Refuse the value of a key.
+
+    Raises:
+        ValueError: it does not hold; names the key, its value and what was expected.
+    """
+    if not holds:
+        raise ValueError(f"{key}={value}: expected {expected}.")
 
 
 def check_keys(cfg: Any) -> None:
-    """Refuse keys that ``+key=value`` appended, which Hydra takes and nothing would read, and keys without a value.
+    """Hold a configuration against its schema.
+
+    Refuses keys that ``+key=value`` appended, which Hydra takes and nothing would read; keys without a value; and
+    values that are not what :func:`positive` and the like ask for.
 
     Raises:
         ValueError: names the keys.
     """
-    if unknown := list(_unknown(cfg, "")):
+    if not OmegaConf.is_config(cfg):
+        return
+    if unknown := [key for key, entry in _entries(cfg, "") if entry is None]:
         raise ValueError(f"{', '.join(unknown)}: there is no such key.")
-    if missing := sorted(OmegaConf.missing_keys(cfg)) if OmegaConf.is_config(cfg) else ():
+    if missing := sorted(OmegaConf.missing_keys(cfg)):
         raise ValueError(f"{', '.join(f'{key}=' for key in missing)}: expected a value (see --help), none was given.")
+    for key, entry in _entries(cfg, ""):
+        value = OmegaConf.select(cfg, key)
+        if entry is not None and "holds" in entry.metadata and value is not None:
+            require(entry.metadata["holds"](value), key, value, entry.metadata["expected"])
 
 
-def _unknown(cfg: Any, prefix: str) -> Iterator[str]:
+def _entries(cfg: Any, prefix: str) -> Iterator[tuple[str, Field | None]]:
+    """The keys of a configuration and those below them, each with its entry in the schema if there is one."""
     schema = OmegaConf.get_type(cfg)
-    if is_dataclass(schema):  # in a mapping any key may be
-        known = {field.name for field in fields(schema)}
-        for key in cfg if OmegaConf.is_config(cfg) else ():
-            if key not in known:
-                yield f"{prefix}{key}"
-            elif not OmegaConf.is_missing(cfg, key) and OmegaConf.is_config(cfg[key]):
-                yield from _unknown(cfg[key], f"{prefix}{key}.")
+    if not is_dataclass(schema):  # in a mapping any key may be
+        return
+    known = {entry.name: entry for entry in fields(schema)}
+    for key in cfg:
+        yield f"{prefix}{key}", known.get(key)
+        if key in known and not OmegaConf.is_missing(cfg, key) and OmegaConf.is_config(cfg[key]):
+            yield from _entries(cfg[key], f"{prefix}{key}.")
 
 
 def require_file_name(out: str) -> None:

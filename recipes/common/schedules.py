@@ -8,6 +8,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from recipes.common.checks import at_least_0, one_of, require
 from torchrl_priors.methods import get_method
 from torchrl_priors.schedules import CosineSchedule, LinearSchedule, PiecewiseSchedule, Schedule
 
@@ -18,10 +19,10 @@ __all__ = ["ScheduleConfig", "applies", "check_schedule", "make_schedule", "with
 class ScheduleConfig:
     """A factor on the coefficients of bonus and auxiliary loss."""
 
-    methods: str = MISSING
-    shape: str = MISSING
+    methods: str = one_of("annealed", "all")
+    shape: str = one_of("linear", "cosine", "piecewise")
     until: float = MISSING
-    end: float = MISSING
+    end: float = at_least_0()
     points: Any = MISSING
 
 
@@ -45,21 +46,12 @@ def make_schedule(cfg: ScheduleConfig, frames: int, value: float = 1.0) -> Sched
 
 
 def check_schedule(cfg: ScheduleConfig) -> None:
-    """Refuse what would fail or mean nothing later.
+    """Refuse what would fail or mean nothing later, beyond what the schema says.
 
     Raises:
         ValueError: names the key, its value and what was expected.
     """
-    for key, value, allowed in (
-        ("methods", cfg.methods, ("annealed", "all")),
-        ("shape", cfg.shape, ("linear", "cosine", "piecewise")),
-    ):
-        if value not in allowed:
-            raise ValueError(f"schedule.{key}={value}: expected one of {', '.join(allowed)}.")
-    if not 0 < cfg.until <= 1:
-        raise ValueError(f"schedule.until={cfg.until}: expected a share of the training in (0, 1].")
-    if not 0 <= cfg.end < float("inf"):
-        raise ValueError(f"schedule.end={cfg.end}: expected a number of at least 0.")
+    require(0 < cfg.until <= 1, "schedule.until", cfg.until, "a share of the training in (0, 1]")
     if cfg.shape == "piecewise":
         try:
             points = [(float(part), float(factor)) for part, factor in cfg.points]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -13,12 +12,12 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 import recipes.common.sweeps  # noqa: F401  registers the launcher that conf/mujoco.yaml names
-from recipes.common.checks import check_keys, require_compiler
+from recipes.common.checks import at_least_0, check_keys, finite, one_of, positive, require, require_compiler, share
 from recipes.common.loggers import LOGGERS, require_logger
 from recipes.common.schedules import ScheduleConfig, check_schedule
 from torchrl_priors.methods import MethodSpec, get_method
 
-__all__ = ["ALONE", "MujocoConfig", "check", "method_of", "require", "teachers"]
+__all__ = ["ALONE", "MujocoConfig", "check", "method_of", "teachers"]
 
 ALONE = "alone"
 """The student of a trial that has no teacher."""
@@ -30,9 +29,9 @@ class Env:
 
     id: str = MISSING
     version: str = MISSING
-    num_envs: int = MISSING
-    frames_per_batch: int = MISSING
-    minibatch_size: int = MISSING
+    num_envs: int = positive()
+    frames_per_batch: int = positive()
+    minibatch_size: int = positive()
     total_frames: int = MISSING
     degrade_feature: int = MISSING
     degrade_threshold: float = MISSING
@@ -44,20 +43,20 @@ class Prior:
     """The teacher."""
 
     path: Any = MISSING
-    degrade: str = MISSING
+    degrade: str = one_of("none", "structural", "random")
     feature: int = MISSING
-    threshold: float = MISSING
-    prob: float = MISSING
+    threshold: float = finite()
+    prob: float = share()
 
 
 @dataclass
 class Weight:
     """The prior weight."""
 
-    lr_coeff: float = MISSING
-    init_bias: float = MISSING
-    trained: str = MISSING
-    epochs: int = MISSING
+    lr_coeff: float = at_least_0()
+    init_bias: float = finite()
+    trained: str = one_of("minibatch", "rollout", "oracle")
+    epochs: int = positive()
 
 
 @dataclass
@@ -75,22 +74,22 @@ class Trial:
 class LetGo:
     """When a teacher that helped is let go."""
 
-    methods: str = MISSING
-    window: int = MISSING
+    methods: str = one_of("trial", "all", "none")
+    window: int = positive()
 
 
 @dataclass
 class PPO:
     """The base algorithm."""
 
-    epochs: int = MISSING
-    clip_epsilon: float = MISSING
-    lr: float = MISSING
-    adam_eps: float = MISSING
-    gamma: float = MISSING
-    gae_lambda: float = MISSING
-    entropy_coeff: float = MISSING
-    max_grad_norm: float = MISSING
+    epochs: int = positive()
+    clip_epsilon: float = positive()
+    lr: float = positive()
+    adam_eps: float = positive()
+    gamma: float = share()
+    gae_lambda: float = share()
+    entropy_coeff: float = at_least_0()
+    max_grad_norm: float = positive()
     hidden: list[int] = MISSING
 
 
@@ -98,16 +97,16 @@ class PPO:
 class Evaluation:
     """When and how the frozen policy is evaluated."""
 
-    interval: int = MISSING
-    episodes: int = MISSING
+    interval: int = positive()
+    episodes: int = positive()
 
 
 @dataclass
 class Checkpoints:
     """What an interruption costs."""
 
-    interval: int = MISSING
-    keep: int = MISSING
+    interval: int = positive()
+    keep: int = positive()
 
 
 @dataclass
@@ -116,24 +115,24 @@ class MujocoConfig:
 
     env: Env = field(default_factory=Env)
     method: str = MISSING
-    seed: int = MISSING
-    total_frames: int = MISSING
+    seed: int = at_least_0(below=2**32)
+    total_frames: int = positive()
     prior: Prior = field(default_factory=Prior)
     weight: Weight = field(default_factory=Weight)
     trial: Trial = field(default_factory=Trial)
     let_go: LetGo = field(default_factory=LetGo)
-    cross_entropy: str | None = MISSING
-    td_error: str = MISSING
-    centering: str = MISSING
-    bonus_coeff: float = MISSING
-    aux_coeff: float | None = MISSING
+    cross_entropy: str | None = one_of("student", "teacher")
+    td_error: str = one_of("original", "shaped")
+    centering: str = one_of("none", "prior", "policy")
+    bonus_coeff: float = at_least_0()
+    aux_coeff: float | None = at_least_0()
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     ppo: PPO = field(default_factory=PPO)
     evaluation: Evaluation = field(default_factory=Evaluation)
     checkpoint: Checkpoints = field(default_factory=Checkpoints)
     compile: bool = MISSING
     resume: bool = MISSING
-    logger: str = MISSING
+    logger: str = one_of(*LOGGERS)
     out: str | None = MISSING
 
 
@@ -157,16 +156,6 @@ def method_of(cfg: MujocoConfig) -> MethodSpec:
     return spec if cfg.cross_entropy is None else replace(spec, cross_entropy=cfg.cross_entropy)  # type: ignore[arg-type]
 
 
-def require(holds: bool, key: str, value: Any, expected: str) -> None:
-    """Refuse the value of a key.
-
-    Raises:
-        ValueError: it does not hold; names the key, its value and what was expected.
-    """
-    if not holds:
-        raise ValueError(f"{key}={value}: expected {expected}.")
-
-
 def check(cfg: MujocoConfig) -> None:
     """Refuse what would fail or mean nothing later.
 
@@ -184,55 +173,9 @@ def check(cfg: MujocoConfig) -> None:
         require(len(files) == 1, "prior.path", cfg.prior.path, f"{expected}, as method={cfg.method} has one")
     if cfg.method == "trial" or cfg.let_go.methods == "all":
         _check_trial(cfg)
-    options = {
-        "td_error": (cfg.td_error, ("original", "shaped")),
-        "centering": (cfg.centering, ("none", "prior", "policy")),
-        "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
-        "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "oracle")),
-        "let_go.methods": (cfg.let_go.methods, ("trial", "all", "none")),
-        "cross_entropy": (cfg.cross_entropy, (None, "student", "teacher")),
-        "logger": (cfg.logger, LOGGERS),
-    }
-    for key, (choice, allowed) in options.items():
-        require(choice in allowed, key, choice, f"one of {', '.join(map(str, allowed))}")
     check_schedule(cfg.schedule)
     if spec.relative:
         require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
-    positive = {
-        "total_frames": cfg.total_frames,
-        "env.num_envs": cfg.env.num_envs,
-        "env.frames_per_batch": cfg.env.frames_per_batch,
-        "env.minibatch_size": cfg.env.minibatch_size,
-        "ppo.epochs": cfg.ppo.epochs,
-        "ppo.lr": cfg.ppo.lr,
-        "ppo.clip_epsilon": cfg.ppo.clip_epsilon,
-        "ppo.adam_eps": cfg.ppo.adam_eps,
-        "ppo.max_grad_norm": cfg.ppo.max_grad_norm,
-        "weight.epochs": cfg.weight.epochs,
-        "let_go.window": cfg.let_go.window,
-        "evaluation.interval": cfg.evaluation.interval,
-        "evaluation.episodes": cfg.evaluation.episodes,
-        "checkpoint.interval": cfg.checkpoint.interval,
-        "checkpoint.keep": cfg.checkpoint.keep,
-    }
-    for key, value in positive.items():
-        require(0 < value < float("inf"), key, value, "a positive number")
-    at_least_0 = {
-        "seed": cfg.seed,
-        "bonus_coeff": cfg.bonus_coeff,
-        "aux_coeff": 0.0 if cfg.aux_coeff is None else cfg.aux_coeff,
-        "weight.lr_coeff": cfg.weight.lr_coeff,
-        "ppo.entropy_coeff": cfg.ppo.entropy_coeff,
-    }
-    for key, value in at_least_0.items():
-        require(0 <= value < float("inf"), key, value, "a number of at least 0")
-    require(cfg.seed < 2**32, "seed", cfg.seed, "a number below 2**32")
-    finite = {"weight.init_bias": cfg.weight.init_bias, "prior.threshold": cfg.prior.threshold}
-    for key, value in finite.items():
-        require(math.isfinite(value), key, value, "a finite number")
-    shares = {"ppo.gamma": cfg.ppo.gamma, "ppo.gae_lambda": cfg.ppo.gae_lambda, "prior.prob": cfg.prior.prob}
-    for key, value in shares.items():
-        require(0 <= value <= 1, key, value, "a number in [0, 1]")
     require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
     if cfg.weight.trained == "oracle":
         degrade = cfg.prior.degrade

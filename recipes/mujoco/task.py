@@ -9,7 +9,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from tensordict import TensorDict
 
-from recipes.mujoco.config import MujocoConfig, check, require, teachers
+from recipes.common.checks import require
+from recipes.mujoco.config import MujocoConfig, check, teachers
 from torchrl_priors import ActionPrior
 from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env

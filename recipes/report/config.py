@@ -8,7 +8,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
-from recipes.common.checks import check_keys
+from recipes.common.checks import check_keys, one_of, positive, require
 
 __all__ = ["Bootstrap", "ReportConfig", "check"]
 
@@ -18,7 +18,7 @@ class Bootstrap:
     """Confidence intervals."""
 
     confidence: float = MISSING
-    reps: int = MISSING
+    reps: int = positive()
     seed: int = MISSING
 
 
@@ -30,7 +30,7 @@ class ReportConfig:
     out: str = MISSING
     baseline: str = MISSING
     compare: list[str] = MISSING
-    pairing: str = MISSING
+    pairing: str = one_of("seed", "mean")
     rename: dict[str, str] = MISSING
     same: list[str] = MISSING
     with_prior: list[str] = MISSING
@@ -51,12 +51,8 @@ def check(cfg: ReportConfig) -> None:
         ValueError: names the key, its value and what was expected.
     """
     check_keys(cfg)
-    if cfg.pairing not in ("seed", "mean"):
-        raise ValueError(f"pairing={cfg.pairing}: expected seed or mean.")
     for key, choices in cfg.only_for.items():
         if choices.count("=") != 1:
             raise ValueError(f"only_for.{key}={choices}: expected another key and its choices, such as key=a|b.")
-    if not 0 < cfg.bootstrap.confidence < 1:
-        raise ValueError(f"bootstrap.confidence={cfg.bootstrap.confidence}: expected a number in (0, 1).")
-    if cfg.bootstrap.reps < 1:
-        raise ValueError(f"bootstrap.reps={cfg.bootstrap.reps}: expected a positive number.")
+    confidence = cfg.bootstrap.confidence
+    require(0 < confidence < 1, "bootstrap.confidence", confidence, "a number in (0, 1)")
