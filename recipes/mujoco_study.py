@@ -111,6 +111,8 @@ def _run(
     chosen = {"method": label.split()[0]} | dict(cfg.set) | dict(block.get("set") or {}) | dict(advice) | dict(settings)
     overrides = [f"env={env}", f"seed={seed}"]
     overrides += [f"{name}={str(value).format(env=env)}" for name, value in chosen.items()]
+    if label != chosen["method"]:
+        overrides.append(f"label='{label}'")
     folder = Path(cfg.work) / env / f"{label.replace(' ', '-').replace('=', '')}-{teacher}-{seed}"
     return StudyRun((env, teacher, label, seed), tuple(overrides), folder)
 

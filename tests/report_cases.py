@@ -102,5 +102,7 @@ def write_study(root: Path, envs: tuple[str, ...] = ("HalfCheetah", "Hopper"), s
             for prior in ("good",) if method == "none" else ("good", "bad"):
                 for seed in range(seeds):
                     name = f"{env}-{method}-{coeff}-{prior}-{seed}"
-                    write_run(root / name, env, method, prior, seed, config={"weight": {"lr_coeff": coeff}})
+                    label = method if coeff == 1 else f"{method} Cω={coeff}"
+                    settings = {"weight": {"lr_coeff": coeff}, "label": label}
+                    write_run(root / name, env, method, prior, seed, config=settings)
     return root

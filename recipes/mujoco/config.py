@@ -133,6 +133,7 @@ class MujocoConfig:
     compile: bool = MISSING
     resume: bool = MISSING
     logger: str = one_of(*LOGGERS)
+    label: str | None = MISSING
     out: str | None = MISSING
 
 

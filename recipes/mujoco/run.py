@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["Run", "Supervisor", "TrainingError", "identity"]
 
 #: What the results do not depend on.
-_INCIDENTAL = ("out", "resume", "logger", "checkpoint")
+_INCIDENTAL = ("label", "out", "resume", "logger", "checkpoint")
 
 
 class TrainingError(RuntimeError):

@@ -32,12 +32,6 @@ class ReportConfig:
     compare: list[str] = MISSING
     pairing: str = one_of("seed", "mean")
     rename: dict[str, str] = MISSING
-    same: list[str] = MISSING
-    with_prior: list[str] = MISSING
-    with_bonus: list[str] = MISSING
-    with_weight: list[str] = MISSING
-    only_for: dict[str, str] = MISSING
-    abbreviate: dict[str, str] = MISSING
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
 
 
@@ -51,8 +45,5 @@ def check(cfg: ReportConfig) -> None:
         ValueError: names the key, its value and what was expected.
     """
     check_keys(cfg)
-    for key, choices in cfg.only_for.items():
-        if choices.count("=") != 1:
-            raise ValueError(f"only_for.{key}={choices}: expected another key and its choices, such as key=a|b.")
     confidence = cfg.bootstrap.confidence
     require(0 < confidence < 1, "bootstrap.confidence", confidence, "a number in (0, 1)")

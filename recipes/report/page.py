@@ -15,7 +15,7 @@ from recipes.report import gridworld
 from recipes.report.config import ReportConfig, check
 from recipes.report.figures import TRAINING, curve_table, figures
 from recipes.report.markdown import interval, pivot, plus_minus, table
-from recipes.report.runs import LeftOut, Run, find, is_gridworld, name_groups, read, short_paths, without_misfits
+from recipes.report.runs import LeftOut, Run, find, is_gridworld, name_priors, read, short_paths, without_misfits
 from recipes.report.study import is_study, read_study
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.plots import save_figure
@@ -66,10 +66,12 @@ def report(cfg: ReportConfig) -> Path:
 
 def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
     found, left_out = read([folder for folder in folders if not is_study(folder)])
-    name_groups(found, cfg)
+    name_priors(found)
     for path in filter(is_study, folders):
         runs, unknown = read_study(path)
         found, left_out = found + runs, left_out + unknown
+    for run in found:
+        run.label = cfg.rename.get(run.label, run.label)
     usable, misfits = without_misfits(found)
     return usable, left_out + misfits
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from glob import glob
@@ -16,10 +16,9 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from recipes.common.run_folder import RunFolder, flatten
-from recipes.report.config import ReportConfig
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
-__all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_groups", "read", "short_paths", "without_misfits"]
+__all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_priors", "read", "short_paths", "without_misfits"]
 
 
 @dataclass
@@ -35,7 +34,7 @@ class Run:
     evaluations: pd.DataFrame
     metrics: pd.DataFrame
     prior: str = ""  # how it is called; "" without one
-    label: str = ""  # method, and what tells it apart
+    label: str = ""  # what it is called: its method if it says nothing else
 
     @property
     def degraded(self) -> bool:
@@ -51,7 +50,11 @@ class LeftOut:
     reason: str
 
 
-_UNREAD = "(not read)"  # the value of a setting without effect, equal to any other
+#: What runs of one label may differ in; and what those without a teacher, and those without a weight, do not read.
+_INCIDENTAL = ["seed", "out", "label", "env.*", "prior.*", "evaluation.*", "checkpoint.*", "resume", "logger"]
+_INCIDENTAL += ["compile", "total_frames"]
+_OF_WEIGHTS = ["weight.*", "td_error"]
+_OF_TEACHERS = [*_OF_WEIGHTS, "bonus_coeff", "aux_coeff", "cross_entropy", "schedule.*", "trial.*", "let_go.*"]
 
 
 class _UnusableError(Exception):
@@ -126,6 +129,7 @@ def _read_whole(folder: Path) -> Run:
         degrade="" if method == "none" else str((config.get("prior") or {}).get("degrade") or "none"),
         method=method,
         seed=seed,
+        label=str(config.get("label") or method),
         settings=flatten(config),
         evaluations=_table(folder / "eval.csv", ["frames", "mean_return"], optional=()),
         metrics=_table(folder / "metrics.csv", needed, optional=("episode*", "aux_coeff", "bonus_coeff"), arm=arm),
@@ -184,7 +188,7 @@ def _env(node: Any) -> str:
         return str(node)
     name, version = str(node["id"]), node.get("version")
     name = name if version is None or name.endswith(f"-{version}") else f"{name}-{version}"
-    changed = ", ".join(f"{key}={_short(value)}" for key, value in (node.get("kwargs") or {}).items())
+    changed = ", ".join(f"{key}={value}" for key, value in (node.get("kwargs") or {}).items())
     return f"{name} ({changed})" if changed else name
 
 
@@ -194,23 +198,22 @@ def spec_of(method: str, settings: Mapping[str, Any]) -> MethodSpec:
     return get_method(str(tried) if method == "trial" else method)
 
 
-def name_groups(runs: Sequence[Run], cfg: ReportConfig) -> None:
-    """Name each run's prior and method, and the settings that runs of one kind in one environment differ in."""
+def name_priors(runs: Sequence[Run]) -> None:
+    """Name each run's prior: by how it is degraded and, where runs of one environment have several, by its file."""
     taught = [run for run in runs if run.degrade]
     files = short_paths(Path(str(run.settings.get("prior.path"))).with_suffix("") for run in taught)
-    for run, told in zip(taught, _differences(taught, lambda run: run.degrade, _prior_settings), strict=True):
+    details = {
+        "path": lambda run: files[Path(str(run.settings.get("prior.path"))).with_suffix("")],
+        "feature": lambda run: f"feature={run.settings.get('prior.feature')}",
+        "threshold": lambda run: f"threshold={run.settings.get('prior.threshold')}",
+        "prob": lambda run: f"prob={run.settings.get('prior.prob')}",
+    }
+    meaningful = {"structural": ("path", "feature", "threshold"), "random": ("path", "prob")}
+    for run in taught:
+        alike = [other for other in taught if (other.env, other.degrade) == (run.env, run.degrade)]
+        told = [details[name] for name in meaningful.get(run.degrade, ("path",))]
         kind = f"degraded teacher ({run.degrade})" if run.degraded else "teacher"
-        settings = (
-            files[Path(str(value)).with_suffix("")] if key == "path" else f"{key}={_short(value)}"
-            for key, value in told.items()
-        )
-        run.prior = ", ".join([kind, *settings])
-    differences = _differences(runs, lambda run: run.method, lambda run: _method_settings(run, cfg))
-    for run, told in zip(runs, differences, strict=True):
-        read = {cfg.abbreviate.get(key, key): _short(value) for key, value in told.items() if value != _UNREAD}
-        settings = (f"{key}={value}" for key, value in read.items())
-        label = " ".join([run.method, *settings])
-        run.label = cfg.rename.get(label, label)
+        run.prior = ", ".join([kind, *(tell(run) for tell in told if len({tell(other) for other in alike}) > 1)])
 
 
 def short_paths(paths: Iterable[Path]) -> dict[Path, str]:
@@ -222,62 +225,33 @@ def short_paths(paths: Iterable[Path]) -> dict[Path, str]:
     return {path: "/".join(path.parts[-depth:]) for path in different}
 
 
-def _differences(
-    runs: Sequence[Run], kind: Callable[[Run], str], settings: Callable[[Run], dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """Of each run's settings those in which runs of its kind differ, in whichever environment they do."""
-    values: dict[tuple[str, str, str], list[str]] = defaultdict(list)
-    counts = Counter((kind(run), run.env) for run in runs)
-    for run in runs:
-        for key, value in settings(run).items():
-            values[kind(run), run.env, key].append(json.dumps(value, sort_keys=True, default=str))
-    unread = json.dumps(_UNREAD)
-    varied = {
-        (name, key)
-        for (name, env, key), found in values.items()
-        if len({*found} - {unread}) > 1 or len(found) < counts[name, env]
-    }
-    return [
-        {key: settings(run).get(key, "default") for name, key in sorted(varied) if name == kind(run)} for run in runs
-    ]
+def _settings(run: Run) -> dict[str, Any]:
+    """The settings that runs of one label share: all that matter to their results, but for seed and environment."""
+    idle = list(_INCIDENTAL)
+    if run.method == "none":
+        idle += _OF_TEACHERS
+    elif not spec_of(run.method, run.settings).adaptive:
+        idle += _OF_WEIGHTS
+    return {key: value for key, value in run.settings.items() if not any(fnmatchcase(key, name) for name in idle)}
 
 
-def _prior_settings(run: Run) -> dict[str, Any]:
-    meaningful = {"structural": ("path", "feature", "threshold"), "random": ("path", "prob")}.get(
-        run.degrade, ("path",)
-    )
-    return {key: run.settings.get(f"prior.{key}") for key in meaningful}
-
-
-def _method_settings(run: Run, cfg: ReportConfig) -> dict[str, Any]:
-    patterns = list(cfg.same)
-    spec = spec_of(run.method, run.settings)
-    patterns += [] if run.method == "trial" or run.settings.get("let_go.methods") == "all" else ["trial.*", "let_go.*"]
-    patterns += cfg.with_prior if run.method == "none" else []
-    patterns += cfg.with_bonus if spec.bonus == "none" else []
-    patterns += [] if spec.adaptive else cfg.with_weight
-    annealed = run.method != "none" and (spec.annealed or run.settings.get("schedule.methods") == "all")
-    patterns += [] if annealed else ["schedule.*"]
-    patterns.append("method")
-    unread: dict[str, Any] = {}
-    for key, choices in cfg.only_for.items():
-        option, chosen = choices.split("=")
-        if run.settings.get(option, chosen) not in (chosen, *chosen.split("|")):
-            unread[key] = _UNREAD
-    settings = run.settings | unread
-    return {key: value for key, value in settings.items() if not any(fnmatchcase(key, pattern) for pattern in patterns)}
-
-
-def _short(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+def _difference(settings: dict[str, Any], usual: dict[str, Any]) -> str:
+    """The first setting that is another one; nothing if there is none."""
+    for key in sorted(settings.keys() | usual.keys()):
+        if key in settings and key in usual and settings[key] != usual[key]:  # else one is older than the key
+            return f"its {key}={settings[key]} is not the {usual[key]}"
+    return ""
 
 
 def without_misfits(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
-    """The runs that can be averaged: one per seed, evaluated when most runs of the environment are; in order."""
+    """The runs that can be averaged: one per seed, like most of their label, evaluated when most are; in order."""
     grids = {
         env: Counter(tuple(run.evaluations["frames"]) for run in runs if run.env == env).most_common(1)[0][0]
         for env in {run.env for run in runs}
     }
+    usual: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
+    for run in runs:
+        usual[run.env, run.prior, run.label].append(_settings(run))
     kept: dict[tuple[str, str, str, int], Run] = {}
     left_out = []
     for run in runs:
@@ -292,6 +266,8 @@ def without_misfits(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
                     f"{len(grid)} times up to {grid[-1]:g}",
                 )
             )
+        elif different := _difference(_settings(run), max(same := usual[key[:3]], key=same.count)):
+            left_out.append(LeftOut(run.path, f"{different} of most runs called {run.label!r}: give it a label"))
         elif key in kept:
             left_out.append(LeftOut(run.path, f"it repeats {kept[key].path} (same method, prior and seed)"))
         else:
