@@ -10,9 +10,8 @@ from __future__ import annotations
 import hydra
 
 from recipes.common.sweeps import fail, start
-from recipes.gridworld import report
 from recipes.gridworld.config import GridworldConfig, check
-from recipes.gridworld.study import open_folder, run_study, sample_world
+from recipes.gridworld.study import open_folder, report, run_study
 
 
 @hydra.main(version_base="1.3", config_path="../../conf", config_name="gridworld")
@@ -22,7 +21,7 @@ def main(cfg: GridworldConfig) -> str | None:
         check(cfg)
         folder = open_folder(cfg)
         results = run_study(cfg, folder)
-        report.write(cfg, folder, sample_world(cfg, cfg.seed), results)
+        report(cfg, folder, results)
     except (ValueError, OSError) as error:
         return fail(f"Error: {error}")
     return None

@@ -16,10 +16,11 @@ from omegaconf import OmegaConf
 from recipes.common.progress import progress_bar
 from recipes.common.run_folder import RunFolder, digest
 from recipes.common.schedules import applies, make_schedule, without_idle
-from recipes.gridworld import learners as parts
-from recipes.gridworld import tabular
+from recipes.gridworld import learners, page, tabular
 from recipes.gridworld.config import GridworldConfig
-from torchrl_priors.envs import GridWorlds, sample_worlds
+from recipes.gridworld.tables import Episodes, prior_weight_curves, tables_of
+from torchrl_priors import plots
+from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
 
 #: What the results do not depend on.
 _INCIDENTAL = ("out", "workers", "block_worlds")
@@ -40,13 +41,13 @@ def sample_world(cfg: GridworldConfig, seed: int) -> GridWorlds:
     return sample_worlds(torch.tensor([seed]), **{name: cfg.world[name] for name in names})  # type: ignore[index]
 
 
-def make_learner(cfg: GridworldConfig, method: str) -> parts.Learner:
+def make_learner(cfg: GridworldConfig, method: str) -> learners.Learner:
     """How the students of a method learn."""
     rates, budget = cfg.student.lr_weight, cfg.evaluation.points * cfg.evaluation.interval
     schedule = None
     if applies(cfg.schedule, method):
         schedule = make_schedule(cfg.schedule, budget)(torch.arange(budget + 1)).double().numpy()
-    return parts.learner_of(
+    return learners.learner_of(
         method,
         gamma=cfg.student.gamma,
         lr=cfg.student.lr,
@@ -70,19 +71,19 @@ class TaughtWorld:
     def __init__(self, cfg: GridworldConfig, seed: int) -> None:
         self.cfg, self.seed = cfg, seed
         self.grid = sample_world(cfg, seed)
-        self.world = parts.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
+        self.world = learners.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
         self.q, self.visited = self.teach()
 
     def teach(self) -> tuple[np.ndarray, np.ndarray]:
         """Action values of the teacher, ``[C, 4]``, and which states it visited, ``[C]``."""
         states, cfg = len(self.world.state), self.cfg.teacher
-        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), parts.generator(self.seed, "teacher")
+        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), learners.generator(self.seed, "teacher")
         tabular.teach(self.world, q, visited, cfg.steps, float(cfg.gamma), float(cfg.lr), float(cfg.epsilon), rng)
         return q, visited
 
     def facts(self) -> dict[str, Any]:
         """What ``worlds.csv`` says about the world and its teacher."""
-        rng = parts.generator(self.seed, "teacher evaluation")
+        rng = learners.generator(self.seed, "teacher evaluation")
         episodes = [tabular.teacher_episode(self.world, self.q, rng) for _ in range(self.cfg.teacher.eval_episodes)]
         total, length = np.mean(episodes, 0)
         return {
@@ -93,17 +94,17 @@ class TaughtWorld:
             "reachable_goal": bool(self.grid.has_goal()),
         }
 
-    def advice(self, prior: str) -> parts.Advice:
+    def advice(self, prior: str) -> learners.Advice:
         """What the prior of this name says."""
-        spec = parts.parse_prior(prior or "expert")
-        return parts.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
+        spec = learners.parse_prior(prior or "expert")
+        return learners.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
 
     def train(
         self,
         method: str,
         prior: str,
-        advice: parts.Advice,
-        learner: parts.Learner,
+        advice: learners.Advice,
+        learner: learners.Learner,
         *,
         watch: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -115,34 +116,34 @@ class TaughtWorld:
             self.world,
             advice,
             learner,
-            parts.new_tables(states, learner.adaptive),
+            learners.new_tables(states, learner.adaptive),
             self.cfg.evaluation.interval,
             log,
             weights,
             visits,
-            parts.generator(self.seed, "student", method, prior),
+            learners.generator(self.seed, "student", method, prior),
         )
         return log, weights, visits
 
 
 def run_world(
-    cfg: GridworldConfig, seed: int, learners: dict[str, parts.Learner], progress: Callable[[int], Any]
+    cfg: GridworldConfig, seed: int, by_method: dict[str, learners.Learner], progress: Callable[[int], Any]
 ) -> dict[str, Any]:
     """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 8]``."""
     taught = TaughtWorld(cfg, seed)
     progress(cfg.teacher.steps)
     advice = {prior: taught.advice(prior) for prior in ("", *cfg.priors)}
     episodes = []
-    for method, prior in parts.runs_of(cfg.methods, cfg.priors):
-        episodes.append(taught.train(method, prior, advice[prior], learners[method])[0].astype(np.float32))
+    for method, prior in learners.runs_of(cfg.methods, cfg.priors):
+        episodes.append(taught.train(method, prior, advice[prior], by_method[method])[0].astype(np.float32))
         progress(cfg.evaluation.points * cfg.evaluation.interval)
     return {**taught.facts(), "episodes": np.stack(episodes)}
 
 
 def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
     """What :func:`run_world` returns, stacked over worlds; blocks of worlds are kept in ``blocks/``."""
-    learners = {method: make_learner(cfg, method) for method in cfg.methods}
-    pairs, budget = parts.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
+    by_method = {method: make_learner(cfg, method) for method in cfg.methods}
+    pairs, budget = learners.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
     per_world = cfg.teacher.steps + len(pairs) * budget
     blocks = {
         f"blocks/{first:06d}": range(first, min(first + cfg.block_worlds, cfg.worlds))
@@ -162,7 +163,7 @@ def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
         bar.update(per_world * sum(len(blocks[name]) for name in kept))
         try:
             futures = {
-                name: [pool.submit(run_world, cfg, cfg.seed + world, learners, progress) for world in blocks[name]]
+                name: [pool.submit(run_world, cfg, cfg.seed + world, by_method, progress) for world in blocks[name]]
                 for name in missing
             }
             for name in missing:
@@ -172,3 +173,27 @@ def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
         finally:
             pool.shutdown(cancel_futures=True)
     return {what: np.concatenate([kept[name][what] for name in blocks]) for what in kept[next(iter(blocks))]}
+
+
+def report(cfg: GridworldConfig, folder: RunFolder, results: dict[str, np.ndarray]) -> None:
+    """Write every table, figure and the page into the folder, and print the main tables and the paths."""
+    data = Episodes(cfg, results["episodes"])
+    tables = tables_of(cfg, data, results)
+    written = [
+        folder.write(f"{name}.csv", table.to_csv(index=False, float_format="%.6g")) for name, table in tables.items()
+    ]
+    pictures = {"world": GridWorldEnv(sample_world(cfg, cfg.seed)).render()}
+    if by_state := prior_weight_curves(cfg, data):
+        steps = np.arange(1, cfg.evaluation.points + 1) * cfg.evaluation.interval
+        pictures["prior_weights"] = plots.weight_curves(by_state, steps)
+    for name, figure in pictures.items():
+        written += plots.save_figure(figure, folder.path / name)
+    if "area_ratio" in tables:
+        ratios = {
+            method: np.stack([data.ratio(method, prior) for prior in cfg.priors], -1)
+            for method in cfg.methods
+            if method != "none"
+        }
+        written += page.write(folder.path, folder.path, ratios)
+        print(f"\n{page.summary(folder.path)}")
+    print("\nWritten:", *(f"  {path}" for path in written), sep="\n")

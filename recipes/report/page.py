@@ -11,7 +11,7 @@ import pandas as pd
 from omegaconf import OmegaConf
 
 from recipes.common.run_folder import write_file
-from recipes.report import gridworld
+from recipes.gridworld import page as gridworld
 from recipes.report.config import ReportConfig, check
 from recipes.report.figures import TRAINING, curve_table, figures
 from recipes.report.markdown import interval, pivot, plus_minus, table
@@ -47,12 +47,12 @@ def report(cfg: ReportConfig) -> Path:
     out = Path(cfg.out)
     studies = {folder.resolve(): folder for folder in folders if is_gridworld(folder)}
     if len(folders) == len(studies) == 1:
-        return gridworld.write(folders[0], out)
+        return gridworld.write(folders[0], out)[-1]
     usable, left_out = _usable(cfg, [folder for folder in folders if folder.resolve() not in studies])
     pages = []
     for path, name in sorted(short_paths(studies).items()):
         try:
-            pages.append(gridworld.write(studies[path], out / name))
+            pages.append(gridworld.write(studies[path], out / name)[-1])
         except ValueError as error:
             left_out.append(LeftOut(studies[path], str(error)))
     for entry in left_out:

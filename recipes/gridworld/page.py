@@ -1,4 +1,4 @@
-"""The page and figures of a gridworld study, from the tables in its folder."""
+"""The page and figures of a gridworld study, from the tables in its folder, and what is said in the terminal."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from omegaconf import OmegaConf
@@ -13,29 +14,35 @@ from omegaconf import OmegaConf
 from recipes.common.run_folder import write_file
 from recipes.report.markdown import interval, pivot, plus_minus, table
 from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import iqm_bars, learning_curves, method_label, prior_label, save_figure
+from torchrl_priors.plots import iqm_bars, learning_curves, method_label, performance_profiles, prior_label, save_figure
 
-__all__ = ["write"]
+__all__ = ["summary", "write"]
 
 _TABLES = ("area_ratio", "curves", "comparisons", "prior_weights", "worlds")
-#: Needs every world's curves, which are in no table: taken from the folder where it is there.
-_TAKEN = ("performance_profiles.pdf", "performance_profiles.png", "world.pdf", "world.png")
+#: Figures of what is in no table: taken from the folder where they are there.
+_TAKEN = ("performance_profiles", "world", "prior_weights")
 
 
-def write(folder: Path, out: Path) -> Path:
-    """Write ``report.md`` and its figures into ``out``; the path of the page.
+def write(folder: Path, out: Path, profiles: dict[str, np.ndarray] | None = None) -> list[Path]:
+    """Write ``report.md`` and its figures into ``out``; their paths, that of the page last.
+
+    Args:
+        folder (Path): of the study.
+        out (Path): may be that folder.
+        profiles (dict, optional): area ratios ``[worlds, priors]`` by method, which no table has.
 
     Raises:
         ValueError: a table or the configuration is missing, damaged or has holes; the message names its file.
     """
     config = _config(folder / "config.yaml")
     tables = {name: _table(folder / f"{name}.csv", optional=name not in _TABLES[:2]) for name in _TABLES}
-    for name, figure in _figures(tables).items():
-        save_figure(figure, out / name)
-    for name in _TAKEN:
+    written = []
+    for name, figure in _figures(tables, profiles).items():
+        written += save_figure(figure, out / name)
+    for name in (f"{name}.{suffix}" for name in _TAKEN for suffix in ("pdf", "png")):
         if (folder / name).exists() and folder.resolve() != out.resolve():
             shutil.copyfile(folder / name, out / name)
-    return write_file(out / "report.md", _page(folder, out, config, tables))
+    return [*written, write_file(out / "report.md", _page(folder, out, config, tables))]
 
 
 def _config(file: Path) -> dict[str, Any]:
@@ -61,7 +68,7 @@ def _table(file: Path, *, optional: bool) -> pd.DataFrame:
     return frame
 
 
-def _figures(tables: dict[str, pd.DataFrame]) -> dict[str, Figure]:
+def _figures(tables: dict[str, pd.DataFrame], profiles: dict[str, np.ndarray] | None) -> dict[str, Figure]:
     ratios, curves = tables["area_ratio"], tables["curves"]
     bars: dict[str, dict[str, ConfidenceInterval]] = {}
     paper: dict[str, dict[str, ConfidenceInterval]] = {}
@@ -79,10 +86,11 @@ def _figures(tables: dict[str, pd.DataFrame]) -> dict[str, Figure]:
         else:
             lines[prior][method] = curve
     steps = curves["transitions"].unique()
-    return {
-        "learning_curves": learning_curves(lines, baseline=baseline, steps=steps),
+    found = {
+        "learning_curves": learning_curves(lines, baseline=baseline, steps=steps, profiles=profiles),
         "iqm": iqm_bars(bars, reference=paper or None),
     }
+    return found if profiles is None else found | {"performance_profiles": performance_profiles(profiles)}
 
 
 def _page(folder: Path, out: Path, config: dict[str, Any], tables: dict[str, pd.DataFrame]) -> str:
@@ -149,3 +157,27 @@ def _weights(weights: pd.DataFrame) -> str:
         for _, row in weights.iterrows()
     ]
     return table(["prior", "method", "average over", "degraded", "non-degraded"], rows, text_columns=3)
+
+
+def summary(folder: Path) -> str:
+    """The main tables for a terminal, in 80 columns whatever the number of methods."""
+    config, ratios = _config(folder / "config.yaml"), _table(folder / "area_ratio.csv", optional=True)
+    parts = [f"Area ratio x 1000, IQM over {config['worlds']} worlds (95 % CI), td_error={config['td_error']}"]
+    lines = [f"{'prior':16}{'method':20}{'here':>20}{'the paper':>20}"]
+    for prior, rows in ratios.groupby("prior", sort=False) if len(ratios) else ():
+        for row in rows.itertuples():
+            here = _cell(row.iqm, row.ci_low, row.ci_high)
+            paper = _cell(row.paper_iqm, row.paper_ci_low, row.paper_ci_high)
+            lines.append(f"{prior:16}{row.method:20}{here:>20}{paper:>20}".rstrip())
+            prior = ""
+    parts.append("\n".join(lines))
+    if len(weights := _table(folder / "prior_weights.csv", optional=True)):
+        by_visit = weights[weights["average"] == "visit"].drop(columns="average")
+        by_visit = by_visit.rename(columns={"non_degraded": "other", "non_degraded_ci": "other_ci"})
+        parts.append("Prior weight in evaluation episodes, by visit (+- 95 % CI)")
+        parts.append(by_visit.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
+    return "\n\n".join(parts)
+
+
+def _cell(estimate: float, low: float, high: float) -> str:
+    return "" if np.isnan(estimate) else f"{1000 * estimate:.0f} ({1000 * low:.0f}, {1000 * high:.0f})"

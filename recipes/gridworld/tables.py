@@ -1,4 +1,4 @@
-"""From the evaluation episodes of a gridworld study to its tables and figures."""
+"""From the evaluation episodes of a gridworld study to its tables."""
 
 from __future__ import annotations
 
@@ -6,17 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from recipes.common.run_folder import RunFolder
 from recipes.gridworld.config import GridworldConfig
 from recipes.gridworld.learners import runs_of
 from recipes.gridworld.tabular import LOG_FIELDS
-from torchrl_priors import plots
-from torchrl_priors.envs import GridWorldEnv, GridWorlds
 from torchrl_priors.methods import get_method
 from torchrl_priors.metrics import (
-    ConfidenceInterval,
     area_ratio,
     area_under_curve,
     iqm,
@@ -24,8 +19,9 @@ from torchrl_priors.metrics import (
     stratified_bootstrap_ci,
 )
 
-__all__ = ["write"]
+__all__ = ["Episodes", "tables_of"]
 
+#: What the paper reports.
 _PAPER = Path(__file__).with_name("paper_area_ratio.csv")
 #: Pairs of methods worth a direct comparison on the same worlds.
 _COMPARISONS = (
@@ -128,28 +124,16 @@ def world_table(results: dict[str, np.ndarray], data: Episodes) -> pd.DataFrame:
     return pd.DataFrame({**facts, "baseline_area": data.baseline})
 
 
-def learning_curves(cfg: GridworldConfig, data: Episodes) -> dict[str, dict[str, ConfidenceInterval]]:
-    """Mean return at each evaluation point with pointwise intervals, by prior and method."""
-    baseline = mean_confidence_interval(data.of("none", "", "return"))
-    curves = {}
-    for prior in cfg.priors:
-        curves[prior] = {"none": baseline}
-        for method in cfg.methods:
-            if method != "none":
-                curves[prior][method] = mean_confidence_interval(data.of(method, prior, "return"))
-    return curves
-
-
-def curve_table(cfg: GridworldConfig, curves: dict[str, dict[str, ConfidenceInterval]]) -> pd.DataFrame:
-    """The learning curves in long form."""
+def curve_table(cfg: GridworldConfig, data: Episodes) -> pd.DataFrame:
+    """Mean return at each evaluation point with pointwise intervals; that of the baseline with every prior."""
     steps = np.arange(1, cfg.evaluation.points + 1) * cfg.evaluation.interval
-    frames = [
-        pd.DataFrame({"prior": prior, "method": method, "transitions": steps}).assign(
-            mean=curve.estimate, ci_low=curve.low, ci_high=curve.high
-        )
-        for prior, by_method in curves.items()
-        for method, curve in by_method.items()
-    ]
+    curves = {pair: mean_confidence_interval(data.of(*pair, "return")) for pair in data.pairs}
+    frames = []
+    for prior in cfg.priors:
+        for method in cfg.methods:
+            curve = curves[method, "" if method == "none" else prior]
+            frame = pd.DataFrame({"prior": prior, "method": method, "transitions": steps})
+            frames.append(frame.assign(mean=curve.estimate, ci_low=curve.low, ci_high=curve.high))
     return pd.concat(frames)
 
 
@@ -166,76 +150,13 @@ def prior_weight_curves(cfg: GridworldConfig, data: Episodes) -> dict[str, dict[
     return curves
 
 
-def figures(
-    cfg: GridworldConfig, data: Episodes, ratios: pd.DataFrame, curves: dict[str, dict[str, ConfidenceInterval]]
-) -> dict[str, Figure]:
-    """The paper's figures, by the name of their file."""
-    methods = [method for method in cfg.methods if method != "none"]
-    profiles = {method: np.stack([data.ratio(method, prior) for prior in cfg.priors], -1) for method in methods}
-    bars: dict[str, dict[str, ConfidenceInterval]] = {prior: {} for prior in cfg.priors}
-    paper: dict[str, dict[str, ConfidenceInterval]] = {prior: {} for prior in cfg.priors}
-    for row in ratios.itertuples():
-        bars[row.prior][row.method] = ConfidenceInterval(row.iqm, row.ci_low, row.ci_high)
-        if not np.isnan(row.paper_iqm):
-            paper[row.prior][row.method] = ConfidenceInterval(row.paper_iqm, row.paper_ci_low, row.paper_ci_high)
-    shown = {prior: {m: curve for m, curve in by_method.items() if m != "none"} for prior, by_method in curves.items()}
-    steps = np.arange(1, cfg.evaluation.points + 1) * cfg.evaluation.interval
-    return {
-        "learning_curves": plots.learning_curves(
-            shown, baseline=curves[cfg.priors[0]]["none"], steps=steps, profiles=profiles
-        ),
-        "performance_profiles": plots.performance_profiles(profiles),
-        "iqm": plots.iqm_bars(bars, reference=paper if any(paper.values()) else None),
-    }
-
-
-def write(cfg: GridworldConfig, folder: RunFolder, world: GridWorlds, results: dict[str, np.ndarray]) -> None:
-    """Write every table and figure into the folder, and print the main table and the paths."""
-    data = Episodes(cfg, results["episodes"])
-    curves = learning_curves(cfg, data)
-    ratios, weights = area_ratio_table(cfg, data), prior_weight_table(cfg, data)
+def tables_of(cfg: GridworldConfig, data: Episodes, results: dict[str, np.ndarray]) -> dict[str, pd.DataFrame]:
+    """Every table of a study that has rows, by the name of its file."""
     tables = {
-        "area_ratio": ratios,
+        "area_ratio": area_ratio_table(cfg, data),
         "comparisons": comparison_table(cfg, data),
-        "prior_weights": weights,
+        "prior_weights": prior_weight_table(cfg, data),
         "worlds": world_table(results, data),
-        "curves": curve_table(cfg, curves),
+        "curves": curve_table(cfg, data),
     }
-    written = [
-        folder.write(f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
-        for name, table in tables.items()
-        if len(table)
-    ]
-    pictures = {"world": GridWorldEnv(world).render()}
-    if len(ratios):
-        pictures |= figures(cfg, data, ratios, curves)
-    if by_state := prior_weight_curves(cfg, data):
-        steps = np.arange(1, cfg.evaluation.points + 1) * cfg.evaluation.interval
-        pictures["prior_weights"] = plots.weight_curves(by_state, steps)
-    for name, figure in pictures.items():
-        written += plots.save_figure(figure, folder.path / name)
-
-    print(f"\nArea ratio x 1000, IQM over {cfg.worlds} worlds (95 % CI), td_error={cfg.td_error}\n")
-    print(_readable(ratios))
-    if len(weights):
-        print("\nPrior weight in evaluation episodes, by visit (+- 95 % CI)\n")
-        by_visit = weights[weights.average == "visit"].drop(columns="average")
-        by_visit = by_visit.rename(columns={"non_degraded": "other", "non_degraded_ci": "other_ci"})
-        print(by_visit.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
-    print("\nWritten:", *(f"  {path}" for path in written), sep="\n")
-
-
-def _readable(ratios: pd.DataFrame) -> str:
-    """A block per prior, which fits into 80 columns whatever the number of methods."""
-
-    def cell(estimate: float, low: float, high: float) -> str:
-        return "" if np.isnan(estimate) else f"{1000 * estimate:.0f} ({1000 * low:.0f}, {1000 * high:.0f})"
-
-    lines = [f"{'prior':16}{'method':20}{'here':>20}{'the paper':>20}"]
-    for prior, rows in ratios.groupby("prior", sort=False):
-        for row in rows.itertuples():
-            here = cell(row.iqm, row.ci_low, row.ci_high)
-            paper = cell(row.paper_iqm, row.paper_ci_low, row.paper_ci_high)
-            lines.append(f"{prior:16}{row.method:20}{here:>20}{paper:>20}".rstrip())
-            prior = ""
-    return "\n".join(lines)
+    return {name: table for name, table in tables.items() if len(table)}
