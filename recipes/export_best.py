@@ -16,7 +16,7 @@ from omegaconf import MISSING
 
 from recipes.common.checks import check_keys, require_file_name
 from recipes.common.sweeps import start
-from recipes.report.runs import Run, find, read
+from recipes.report.runs import FinishedRun, find, read
 from torchrl_priors.artifacts import read_manifest
 from torchrl_priors.artifacts.format import write_atomically
 
@@ -34,7 +34,7 @@ class ExportConfig:
 ConfigStore.instance().store(group="schema", name="export_best", node=ExportConfig, package="_global_")
 
 
-def last_return(run: Run) -> float:
+def last_return(run: FinishedRun) -> float:
     """Mean return of the run's last evaluation."""
     return float(run.evaluations["mean_return"].iloc[-1])
 

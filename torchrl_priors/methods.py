@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 __all__ = ["METHODS", "MethodSpec", "get_method"]
@@ -26,6 +26,8 @@ class MethodSpec:
         aux_coeff: the coefficient of the auxiliary loss where none is given.
         annealed: whether the method's coefficients are meant to go to 0 over training. Whoever runs the loop does that,
             with a :class:`~torchrl_priors.schedules.CoeffScheduler`; losses and transforms do not read it.
+        label: how figures call it. Defaults to ``""``, its name.
+        color: of its lines in figures. Defaults to ``""``, one that follows from its name.
     """
 
     bonus: Literal["none", "current", "next"]
@@ -36,32 +38,57 @@ class MethodSpec:
     cross_entropy: Literal["student", "teacher"] = "student"
     aux_coeff: float = 1.0
     annealed: bool = False
+    label: str = field(default="", compare=False)
+    color: str = field(default="", compare=False)
 
     def __post_init__(self) -> None:
         if self.relative and (self.bonus != "current" or self.adaptive):
             raise ValueError(f"A relative bonus is the current one, without a learned weight: got {self}.")
 
 
+# Colours: Okabe & Ito's palette, safe for colour-blind readers, warm without a learned weight and cool with one; and Tol's.
 METHODS: dict[str, MethodSpec] = {
-    "none": MethodSpec(bonus="none", auxiliary=False, adaptive=False),
+    "none": MethodSpec("none", auxiliary=False, adaptive=False, label="Baseline", color="#000000"),
     # Centa & Preux; er and e2r after Czarnecki et al., "Distilling Policy Distillation" (2019)
-    "er": MethodSpec(bonus="current", auxiliary=False, adaptive=False),
-    "e2r": MethodSpec(bonus="next", auxiliary=True, adaptive=False),
-    "aer": MethodSpec(bonus="current", auxiliary=False, adaptive=True),
-    "ae2r": MethodSpec(bonus="next", auxiliary=True, adaptive=True),
+    "er": MethodSpec("current", auxiliary=False, adaptive=False, label="ER", color="#E69F00"),
+    "e2r": MethodSpec("next", auxiliary=True, adaptive=False, label="E2R", color="#D55E00"),
+    "aer": MethodSpec("current", auxiliary=False, adaptive=True, label="AER", color="#56B4E9"),
+    "ae2r": MethodSpec("next", auxiliary=True, adaptive=True, label="AE2R", color="#0072B2"),
     # beyond the paper
-    "kickstart": MethodSpec(bonus="none", auxiliary=True, adaptive=False),
-    "pull": MethodSpec(bonus="none", auxiliary=True, adaptive=False, cross_entropy="teacher", aux_coeff=0.3),
+    "kickstart": MethodSpec("none", auxiliary=True, adaptive=False, label="Kickstart", color="#CC79A7"),
+    "pull": MethodSpec(
+        "none",
+        auxiliary=True,
+        adaptive=False,
+        cross_entropy="teacher",
+        aux_coeff=0.3,
+        label="Pull",
+        color="#332288",
+    ),
     "aligned": MethodSpec(
-        bonus="none", auxiliary=True, adaptive=True, weight_target="advantage", cross_entropy="teacher"
+        "none",
+        auxiliary=True,
+        adaptive=True,
+        weight_target="advantage",
+        cross_entropy="teacher",
+        label="Aligned",
+        color="#009E73",
     ),
     # the field's baselines: Schmitt et al., "Kickstarting Deep Reinforcement Learning" (2018), with a schedule in place
     # of population-based training; and the KL penalty in the reward of KL-regularised RL, e.g. Teh et al., "Distral"
     # (2017), Galashov et al., "Information asymmetry in KL-regularized RL" (2019)
     "annealed_kickstart": MethodSpec(
-        bonus="none", auxiliary=True, adaptive=False, cross_entropy="teacher", annealed=True
+        "none",
+        auxiliary=True,
+        adaptive=False,
+        cross_entropy="teacher",
+        annealed=True,
+        label="Annealed kickstart",
+        color="#882255",
     ),
-    "kl_penalty": MethodSpec(bonus="current", auxiliary=False, adaptive=False, relative=True),
+    "kl_penalty": MethodSpec(
+        "current", auxiliary=False, adaptive=False, relative=True, label="KL penalty", color="#999933"
+    ),
 }
 
 

@@ -15,7 +15,16 @@ from recipes.gridworld import page as gridworld
 from recipes.report.config import ReportConfig, check
 from recipes.report.figures import TRAINING, curve_table, figures
 from recipes.report.markdown import interval, pivot, plus_minus, table
-from recipes.report.runs import LeftOut, Run, find, is_gridworld, name_priors, read, short_paths, without_misfits
+from recipes.report.runs import (
+    FinishedRun,
+    LeftOut,
+    find,
+    is_gridworld,
+    name_priors,
+    read,
+    short_paths,
+    without_misfits,
+)
 from recipes.report.study import is_study, read_study
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 from torchrl_priors.plots import save_figure
@@ -64,7 +73,7 @@ def report(cfg: ReportConfig) -> Path:
     return _index(out, pages, left_out) if studies else pages[0]
 
 
-def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[Run], list[LeftOut]]:
+def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[FinishedRun], list[LeftOut]]:
     found, left_out = read([folder for folder in folders if not is_study(folder)])
     name_priors(found)
     for path in filter(is_study, folders):
@@ -92,7 +101,7 @@ def _left_out(entries: Sequence[LeftOut]) -> list[str]:
 
 
 def _report_runs(
-    cfg: ReportConfig, given: str | list[str], usable: Sequence[Run], left_out: Sequence[LeftOut], out: Path
+    cfg: ReportConfig, given: str | list[str], usable: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path
 ) -> Path:
     study = Study(usable, cfg)
     tables = {

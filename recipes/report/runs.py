@@ -18,11 +18,11 @@ from omegaconf import OmegaConf
 from recipes.common.run_folder import RunFolder, flatten
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
-__all__ = ["LeftOut", "Run", "find", "is_gridworld", "name_priors", "read", "short_paths", "without_misfits"]
+__all__ = ["FinishedRun", "LeftOut", "find", "is_gridworld", "name_priors", "read", "short_paths", "without_misfits"]
 
 
 @dataclass
-class Run:
+class FinishedRun:
     """A finished run whose data are whole."""
 
     path: Path
@@ -97,21 +97,21 @@ def is_gridworld(folder: Path) -> bool:
     return not (folder / "status.json").exists() and config.is_file() and b"\nworlds:" in b"\n" + config.read_bytes()
 
 
-def read(folders: Iterable[Path]) -> tuple[list[Run], list[LeftOut]]:
+def read(folders: Iterable[Path]) -> tuple[list[FinishedRun], list[LeftOut]]:
     """The runs in their folders, and those that are not to be used."""
     results = [_read(folder) for folder in folders]
-    runs = [result for result in results if isinstance(result, Run)]
+    runs = [result for result in results if isinstance(result, FinishedRun)]
     return runs, [result for result in results if isinstance(result, LeftOut)]
 
 
-def _read(folder: Path) -> Run | LeftOut:
+def _read(folder: Path) -> FinishedRun | LeftOut:
     try:
         return _read_whole(folder)
     except _UnusableError as reason:
         return LeftOut(folder, str(reason))
 
 
-def _read_whole(folder: Path) -> Run:
+def _read_whole(folder: Path) -> FinishedRun:
     arm = _check_finished(folder).get("arm")
     try:
         # as it is: what another's file has in ${...} could be a secret of this machine, and the report is published
@@ -123,7 +123,7 @@ def _read_whole(folder: Path) -> Run:
     except Exception as error:  # whatever reading a damaged file ends in
         raise _UnusableError(f"config.yaml cannot be used ({type(error).__name__}: {error})") from None
     needed = ["frames", "loss_objective", "entropy"] + ["loss_prior"] * auxiliary
-    return Run(
+    return FinishedRun(
         path=folder,
         env=env,
         degrade="" if method == "none" else str((config.get("prior") or {}).get("degrade") or "none"),
@@ -198,7 +198,7 @@ def spec_of(method: str, settings: Mapping[str, Any]) -> MethodSpec:
     return get_method(str(tried) if method == "trial" else method)
 
 
-def name_priors(runs: Sequence[Run]) -> None:
+def name_priors(runs: Sequence[FinishedRun]) -> None:
     """Name each run's prior: by how it is degraded and, where runs of one environment have several, by its file."""
     taught = [run for run in runs if run.degrade]
     files = short_paths(Path(str(run.settings.get("prior.path"))).with_suffix("") for run in taught)
@@ -225,7 +225,7 @@ def short_paths(paths: Iterable[Path]) -> dict[Path, str]:
     return {path: "/".join(path.parts[-depth:]) for path in different}
 
 
-def _settings(run: Run) -> dict[str, Any]:
+def _settings(run: FinishedRun) -> dict[str, Any]:
     """The settings that runs of one label share: all that matter to their results, but for seed and environment."""
     idle = list(_INCIDENTAL)
     if run.method == "none":
@@ -243,7 +243,7 @@ def _difference(settings: dict[str, Any], usual: dict[str, Any]) -> str:
     return ""
 
 
-def without_misfits(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
+def without_misfits(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], list[LeftOut]]:
     """The runs that can be averaged: one per seed, like most of their label, evaluated when most are; in order."""
     grids = {
         env: Counter(tuple(run.evaluations["frames"]) for run in runs if run.env == env).most_common(1)[0][0]
@@ -252,7 +252,7 @@ def without_misfits(runs: Sequence[Run]) -> tuple[list[Run], list[LeftOut]]:
     usual: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
     for run in runs:
         usual[run.env, run.prior, run.label].append(_settings(run))
-    kept: dict[tuple[str, str, str, int], Run] = {}
+    kept: dict[tuple[str, str, str, int], FinishedRun] = {}
     left_out = []
     for run in runs:
         grid = grids[run.env]

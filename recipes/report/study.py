@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from recipes.mujoco_study import KEY
-from recipes.report.runs import LeftOut, Run
+from recipes.report.runs import FinishedRun, LeftOut
 from torchrl_priors.methods import METHODS
 
 __all__ = ["is_study", "read_study"]
@@ -18,7 +18,7 @@ def is_study(path: Path) -> bool:
     return path.suffix == ".csv" and path.is_file()
 
 
-def read_study(path: Path) -> tuple[list[Run], list[LeftOut]]:
+def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
     """The runs of a study, with the means of their training if its table is beside that of the evaluations.
 
     Raises:
@@ -37,7 +37,7 @@ def read_study(path: Path) -> tuple[list[Run], list[LeftOut]]:
             continue
         measured = {name: [value] for name, value in means.get(key, {}).items()}
         runs.append(
-            Run(
+            FinishedRun(
                 path=path,
                 env=str(env),
                 degrade={"none": "", "good": "none"}.get(str(teacher), str(teacher)),

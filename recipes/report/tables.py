@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from recipes.report.config import ReportConfig
-from recipes.report.runs import Run
+from recipes.report.runs import FinishedRun
 from torchrl_priors.methods import METHODS
 from torchrl_priors.metrics import (
     ConfidenceInterval,
@@ -32,10 +32,10 @@ class Study:
     Runs without a prior are found under every prior of their environment: they are what each is compared with.
     """
 
-    def __init__(self, runs: Sequence[Run], cfg: ReportConfig) -> None:
+    def __init__(self, runs: Sequence[FinishedRun], cfg: ReportConfig) -> None:
         self.cfg = cfg
         self.notes: list[str] = []
-        self._groups: dict[tuple[str, str, str], list[Run]] = {}
+        self._groups: dict[tuple[str, str, str], list[FinishedRun]] = {}
         for run in runs:
             self._groups.setdefault((run.env, run.prior, run.label), []).append(run)
         self.envs = list(dict.fromkeys(run.env for run in runs))
@@ -50,11 +50,11 @@ class Study:
         if text not in self.notes:
             self.notes.append(text)
 
-    def runs(self, env: str, prior: str, label: str) -> list[Run]:
+    def runs(self, env: str, prior: str, label: str) -> list[FinishedRun]:
         """The runs of a method, one a seed."""
         return self._groups.get((env, prior, label)) or self._groups.get((env, "", label), [])
 
-    def groups(self) -> Iterator[tuple[str, str, str, list[Run]]]:
+    def groups(self) -> Iterator[tuple[str, str, str, list[FinishedRun]]]:
         """Every environment, prior and method with runs; what has no prior comes once, under ``""``."""
         for env in self.envs:
             for prior in ("", *(prior for prior in self.priors if prior)):
@@ -94,7 +94,7 @@ class Study:
             ratios[run.seed] = float(area_ratio(area(run), reference)) * (-1.0 if reference < 0 else 1.0)
         return ratios
 
-    def common(self, envs: Sequence[str], prior: str, label: str) -> list[list[Run]]:
+    def common(self, envs: Sequence[str], prior: str, label: str) -> list[list[FinishedRun]]:
         """The runs of a method by seed and environment, of the seeds that it has in each environment."""
         by_seed = [{run.seed: run for run in self.runs(env, prior, label)} for env in envs]
         seeds = sorted(set.intersection(*(set(runs) for runs in by_seed)))
@@ -117,7 +117,7 @@ class Study:
         return np.array([[by_env[env][seed] for env in envs] for seed in seeds])
 
 
-def _method_order(run: Run) -> tuple[int, str]:
+def _method_order(run: FinishedRun) -> tuple[int, str]:
     return [*METHODS, "trial"].index(run.method), run.label
 
 
@@ -131,12 +131,12 @@ def bootstrap(cfg: ReportConfig) -> dict:
     return {"confidence": cfg.bootstrap.confidence, "reps": cfg.bootstrap.reps, "seed": cfg.bootstrap.seed}
 
 
-def area(run: Run) -> float:
+def area(run: FinishedRun) -> float:
     """Area under the evaluation curve, per frame."""
     return float(area_under_curve(run.evaluations["mean_return"]))
 
 
-def final(run: Run) -> float:
+def final(run: FinishedRun) -> float:
     """Mean return of the last evaluation."""
     return float(run.evaluations["mean_return"].iloc[-1])
 

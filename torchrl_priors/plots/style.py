@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
+from torchrl_priors.methods import METHODS
+
 __all__ = ["method_color", "method_label", "prior_label", "save_figure"]
 
 P = ParamSpec("P")
@@ -67,21 +69,8 @@ STYLE: Any = {
 
 BASELINE = "none"
 
-# Okabe & Ito's palette, safe for colour-blind readers: warm without a learned weight, cool with one.
-_METHODS = {
-    BASELINE: ("Baseline", "#000000"),
-    "er": ("ER", "#E69F00"),
-    "e2r": ("E2R", "#D55E00"),
-    "aer": ("AER", "#56B4E9"),
-    "ae2r": ("AE2R", "#0072B2"),
-    "kickstart": ("Kickstart", "#CC79A7"),
-    "aligned": ("Aligned", "#009E73"),
-    "trial": ("Trial", "#117733"),
-    # of Tol's muted palette, for there are no more in that one
-    "annealed_kickstart": ("Annealed kickstart", "#882255"),
-    "kl_penalty": ("KL penalty", "#999933"),
-    "pull": ("Pull", "#332288"),
-}
+#: The trial is no method of a loss: the recipe's name for finding out which one to use.
+_METHODS = {name: (spec.label, spec.color) for name, spec in METHODS.items()} | {"trial": ("Trial", "#117733")}
 _OTHER_COLORS = ("#44AA99", "#DDCC77", "#AA4499", "#661100")
 
 
