@@ -46,7 +46,7 @@ class MethodSpec:
             raise ValueError(f"A relative bonus is the current one, without a learned weight: got {self}.")
 
 
-# Colours: Okabe & Ito's palette, safe for colour-blind readers, warm without a learned weight and cool with one; and Tol's.
+# Colours are Okabe & Ito's, safe for colour-blind readers: warm without a learned weight, cool with one; then Tol's.
 METHODS: dict[str, MethodSpec] = {
     "none": MethodSpec("none", auxiliary=False, adaptive=False, label="Baseline", color="#000000"),
     # Centa & Preux; er and e2r after Czarnecki et al., "Distilling Policy Distillation" (2019)
