@@ -3,7 +3,8 @@
     python -m recipes.mujoco_study study_mujoco=trial [workers=2] [run=false] [key=value ...]
 
 The tables are all that a report needs, and all that has to be kept: ``<name>.csv`` has every evaluation,
-``<name>_training.csv`` the means of what training measured, ``<name>_trials.csv`` who won the trials. A run that is in
+``<name>_training.csv`` the means of what training measured, ``<name>_trials.csv`` who won the trials,
+``<name>_teachers.csv`` the return of each teacher. A run that is in
 them is not run again, on whichever machine they are. One that was interrupted goes on from its checkpoint, and one that
 fails or is killed stops no other. ``run=false`` says what is missing.
 """
@@ -25,8 +26,9 @@ import pandas as pd
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
-from recipes.common.checks import check_keys
+from recipes.common.checks import check_keys, positive
 from recipes.common.sweeps import start
+from torchrl_priors.artifacts import read_manifest
 from torchrl_priors.artifacts.format import write_atomically
 
 #: What a run is known by in the tables.
@@ -46,7 +48,7 @@ class StudyConfig:
     set: dict[str, Any] = MISSING
     teachers: dict[str, dict[str, Any]] = MISSING
     runs: list[Any] = MISSING
-    workers: int = MISSING
+    workers: int = positive()
     run: bool = MISSING
     out: str = MISSING
     work: str = MISSING
@@ -121,7 +123,7 @@ class Tables:
     """What is known of finished runs; every change is written at once, whole or not at all."""
 
     def __init__(self, out: Path, name: str) -> None:
-        self.files = {kind: out / f"{name}{kind}.csv" for kind in ("", "_training", "_trials")}
+        self.files = {kind: out / f"{name}{kind}.csv" for kind in ("", "_training", "_trials", "_teachers")}
         self.rows = {
             kind: pd.read_csv(file, float_precision="round_trip") if file.exists() else pd.DataFrame()
             for kind, file in self.files.items()
@@ -163,8 +165,24 @@ class Tables:
                 self._write(kind)
         return float(evaluations["mean_return"].iloc[-1])
 
+    def add_teachers(self, runs: Sequence[StudyRun]) -> None:
+        """Note the return of each teacher that is used as it is, as its file says."""
+        known = {} if self.rows["_teachers"].empty else dict(self.rows["_teachers"].groupby(KEY[:2])["return"].first())
+        for run in runs:
+            given = dict(override.split("=", 1) for override in run.overrides)
+            file = Path(given.get("prior.path", ""))
+            if file.is_file() and "prior.degrade" not in given:
+                evaluation = read_manifest(file).evaluation
+                if "mean_return" in evaluation:
+                    known[run.key[:2]] = float(evaluation["mean_return"])
+        if known:
+            self.rows["_teachers"] = pd.DataFrame([(*key, value) for key, value in known.items()])
+            self.rows["_teachers"].columns = pd.Index([*KEY[:2], "return"])
+            self._write("_teachers")
+
     def _write(self, kind: str) -> None:
-        ordered = self.rows[kind].sort_values(KEY, kind="stable", ignore_index=True)
+        keys = [name for name in KEY if name in self.rows[kind]]
+        ordered = self.rows[kind].sort_values(keys, kind="stable", ignore_index=True)
         self.files[kind].parent.mkdir(parents=True, exist_ok=True)
         write_atomically(self.files[kind], ordered.to_csv(index=False).encode())
 
@@ -232,12 +250,11 @@ def study(cfg: StudyConfig) -> None:
         ValueError: bad input, or runs that failed; the message names them.
     """
     check_keys(cfg)
-    if cfg.workers < 1:
-        raise ValueError(f"workers={cfg.workers}: expected a number of at least 1.")
     runs, tables = expand(cfg), Tables(Path(cfg.out), cfg.name)
     for run in runs:
         if run.key not in tables.finished() and is_finished(run.folder):
             tables.add(run)
+    tables.add_teachers(runs)
     for line in summary(runs, tables.finished()):
         print(line, flush=True)
     if not cfg.run:

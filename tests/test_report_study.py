@@ -7,10 +7,12 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 
 pytest.importorskip("hydra")
 from hydra import compose, initialize_config_dir
 
+from recipes.report import figures
 from recipes.report.page import report
 
 ROOT = Path(__file__).parents[1]
@@ -47,7 +49,7 @@ def tables(tmp_path) -> Path:
 def test_returns_and_differences_come_from_the_tables(tables, tmp_path):
     report(config(tables, tmp_path / "out"))
     returns = pd.read_csv(tmp_path / "out/returns.csv", keep_default_na=False).set_index(["env", "method"])
-    assert returns.loc[("hopper", "e2r"), ["runs", "frames", "final_iqm", "prior"]].tolist() == [
+    assert returns.loc[("Hopper-v5", "e2r"), ["runs", "frames", "final_iqm", "prior"]].tolist() == [
         3,
         2,
         301,
@@ -55,8 +57,28 @@ def test_returns_and_differences_come_from_the_tables(tables, tmp_path):
     ]
     assert set(returns.index.get_level_values("method")) == {"none", "e2r", "ae2r slow", "trial"}
     dynamics = pd.read_csv(tmp_path / "out/dynamics.csv").set_index(["env", "method", "metric"])
-    assert dynamics.loc[("ant", "e2r", "entropy"), "difference"] == 200
-    assert dynamics.loc[("ant", "ae2r slow", "loss_objective"), "mean"] == -200
+    assert dynamics.loc[("Ant-v5", "e2r", "entropy"), "difference"] == 200
+    assert dynamics.loc[("Ant-v5", "ae2r slow", "loss_objective"), "mean"] == -200
+
+
+def test_there_is_no_interval_of_three_runs(tables, tmp_path):
+    page = report(config(tables, tmp_path / "out")).read_text()
+    returns = pd.read_csv(tmp_path / "out/returns.csv")
+    assert returns[["final_ci_low", "final_ci_high"]].isna().all(axis=None)
+    assert "| Hopper-v5 | good teacher | - | 301 |" in page
+
+
+def test_the_teachers_return_is_a_line_where_a_table_tells_it(tables, tmp_path, monkeypatch):
+    pd.DataFrame({"env": ["hopper"], "teacher": ["good"], "return": [333.0]}).to_csv(
+        tables.with_name("deep_teachers.csv"), index=False
+    )
+    drawn = {}
+    monkeypatch.setattr(figures, "return_curves", lambda *args, **options: drawn.update(options) or Figure())
+    report(config(tables, tmp_path / "out"))
+    levels = drawn["references"]
+    assert list(levels.values()) == [{"teacher": 333.0}]
+    assert next(iter(levels)).startswith("Hopper-v5")
+    assert "n = 3" in next(iter(levels))
 
 
 def test_it_is_the_same_every_time(tables, tmp_path):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from recipes.report.runs import spec_of
 from recipes.report.tables import ALL, Study
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots.benchmark import interval_panels, profile_panels, return_curves
@@ -32,6 +32,7 @@ _POINTS = 50
 def _title(study: Study, env: str, prior: str) -> str:
     shown = "All environments" if env == ALL else env
     title = f"{shown}, {prior}" if prior and len(study.priors) > 1 else shown
+    title += "" if env == ALL else f" (n = {study.number(env, prior)})"
     return title if len(title) <= _TITLE else title.replace(", ", "\n", 1)
 
 
@@ -81,9 +82,7 @@ def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvemen
                 xlim=(-0.02, 1.02),
                 xlabel=f"P(method > {name}), by area",
             )
-    if (weights := _prior_weights(study)) is not None:
-        made["prior_weights"] = weights
-    for metric, (name, differs) in TRAINING.items():
+    for metric, (name, differs) in {**TRAINING, "prior_weight": ("prior weight", False)}.items():
         if (figure := _training(study, metric, name, differs)) is not None:
             made[f"training_{metric}"] = figure
     return made
@@ -117,36 +116,18 @@ def _return_curves(study: Study, curves: pd.DataFrame) -> Figure:
     by_group = dict(iter(curves.groupby(["env", "prior", "method"], sort=False)))
     panels: dict[str, dict[str, ConfidenceInterval]] = {}
     steps: dict[str, np.ndarray] = {}
+    teachers: dict[str, dict[str, float]] = {}
     for env, prior in study.panels():
         title = _title(study, env, prior)
         panels[title] = {}
+        if (level := study.teacher(env, prior)) is not None:
+            teachers[title] = {"teacher": level}
         for label in study.methods(env, prior):
             rows = by_group[env, study.runs(env, prior, label)[0].prior, label]
             panels[title][label] = ConfidenceInterval(*rows[["iqm", "ci_low", "ci_high"]].to_numpy().T)
             steps[title] = rows["frames"].to_numpy()
-    return return_curves(panels, steps, columns=_columns(study), ylabel="Evaluation return (IQM)", baseline=_BASELINE)
-
-
-def _prior_weights(study: Study) -> Figure | None:
-    """Mean prior weight over training, and the states' 5 % and 95 % quantiles, averaged over seeds."""
-    panels: dict[str, dict[str, ConfidenceInterval]] = {}
-    steps: dict[str, dict[str, np.ndarray]] = {}
-    names = ["prior_weight", "prior_weight_q05", "prior_weight_q95"]
-    for env, prior in study.panels():
-        for label in study.methods(env, prior):
-            runs = study.runs(env, prior, label)
-            if spec_of(runs[0].method, runs[0].settings).adaptive and all(
-                set(names) <= set(run.metrics) for run in runs
-            ):
-                mean = pd.concat([run.metrics[["frames", *names]] for run in runs]).groupby("frames").mean()
-                title = _title(study, env, prior)
-                panels.setdefault(title, {})[label] = ConfidenceInterval(*mean[names].to_numpy().T)
-                steps.setdefault(title, {})[label] = mean.index.to_numpy()
-    if not panels:
-        return None
-    return return_curves(
-        panels, steps, columns=_columns(study), ylabel=r"Prior weight $\omega$", ylim=(0, 1), outlined=True
-    )
+    options: Any = {"columns": _columns(study), "ylabel": "Evaluation return (IQM)", "baseline": _BASELINE}
+    return return_curves(panels, steps, references=teachers, **options)
 
 
 def _training(study: Study, metric: str, name: str, differs: bool) -> Figure | None:

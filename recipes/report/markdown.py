@@ -19,7 +19,9 @@ def number(value: float, digits: int = 2) -> str:
 
 
 def interval(estimate: float, low: float, high: float, digits: int = 2) -> str:
-    """An estimate and its interval."""
+    """An estimate and its interval, if it has one."""
+    if np.isnan(low):
+        return number(estimate, digits)
     return f"{number(estimate, digits)} ({number(low, digits)}, {number(high, digits)})"
 
 

@@ -32,7 +32,7 @@ from torchrl_priors.plots import save_figure
 __all__ = ["report"]
 
 _CAPTIONS = {
-    "return_curves": "Evaluation returns: interquartile mean over seeds",
+    "return_curves": "Evaluation returns: interquartile mean over seeds, and the teacher's return",
     "area_ratios": "Area ratio to the baseline",
     "performance_profiles": "Performance profiles of the area ratio over environments and seeds",
     "improvement": "Probability that a run has the larger area under its evaluation curve",
@@ -40,7 +40,7 @@ _CAPTIONS = {
         f"training_{metric}": f"{name[0].upper()}{name[1:]}, over training: mean, lowest and highest seed"
         for metric, (name, _) in TRAINING.items()
     },
-    "prior_weights": "Prior weight over training: mean, and 5 % to 95 % of the states",
+    "training_prior_weight": "Prior weight over training: mean, lowest and highest seed",
 }
 
 
@@ -137,7 +137,7 @@ def _page(
         "# Report",
         f"```bash\npython -m recipes.report runs='{argument}' out={cfg.out}\n```",
         f"{len(used)} runs. Intervals are {level} stratified bootstrap over seeds ({cfg.bootstrap.reps} resamples); "
-        "IQM is the interquartile mean. With fewer than four seeds it is the mean, and its interval is too narrow. "
+        "IQM is the interquartile mean; with fewer than four seeds it is the mean, and there is no interval. "
         f"Area: mean return over the evaluations. Baseline: `{cfg.baseline}`.",
     ]
     seeds = used.groupby(["env", "prior", "method"], sort=False)["seed"].agg(list).reset_index()
@@ -170,7 +170,7 @@ def _page(
             ]
         parts += [_figure(name) for name in pictures if name.startswith("improvement")]
     parts += ["## Training", _dynamics(tables["dynamics"])]
-    parts += [_figure(name) for name in pictures if name.startswith(("training_", "prior_weights"))]
+    parts += [_figure(name) for name in pictures if name.startswith("training_")]
     files = ", ".join(f"[`{name}.csv`]({name}.csv)" for name in tables)
     parts.append(f"All numbers: {files}. Figures are there as PDF too.")
     return "\n\n".join(parts) + "\n"

@@ -33,6 +33,7 @@ class FinishedRun:
     settings: dict[str, Any]
     evaluations: pd.DataFrame
     metrics: pd.DataFrame
+    teacher_return: float | None = None
     prior: str = ""  # how it is called; "" without one
     label: str = ""  # what it is called: its method if it says nothing else
 
@@ -116,7 +117,7 @@ def _read_whole(folder: Path) -> FinishedRun:
     try:
         # as it is: what another's file has in ${...} could be a secret of this machine, and the report is published
         config: Any = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
-        method, seed, env = str(config["method"]), int(config["seed"]), _env(config["env"])
+        method, seed, env = str(config["method"]), int(config["seed"]), env_name(config["env"])
         auxiliary = spec_of(method, config).auxiliary and method != "trial"  # whose winner may have no teacher
     except FileNotFoundError:
         raise _UnusableError("config.yaml is missing") from None
@@ -182,7 +183,7 @@ def _table(file: Path, needed: Sequence[str], optional: Sequence[str], arm: str 
     return table
 
 
-def _env(node: Any) -> str:
+def env_name(node: Any) -> str:
     """The name of an environment with its version, from the group ``env`` or a plain name."""
     if not isinstance(node, dict):
         return str(node)

@@ -5,12 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pandas as pd
+from omegaconf import OmegaConf
 
 from recipes.mujoco_study import KEY
-from recipes.report.runs import FinishedRun, LeftOut
+from recipes.report.runs import FinishedRun, LeftOut, env_name
 from torchrl_priors.methods import METHODS
 
 __all__ = ["is_study", "read_study"]
+
+_ENVS = Path(__file__).parents[2] / "conf" / "env"
 
 
 def is_study(path: Path) -> bool:
@@ -27,6 +30,9 @@ def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
     evaluations = _table(path, [*KEY, "frames", "return"])
     beside = path.with_name(f"{path.stem}_training.csv")
     training = _table(beside, [*KEY, "metric", "mean"]) if beside.exists() else pd.DataFrame(columns=[*KEY, "metric"])
+    beside = path.with_name(f"{path.stem}_teachers.csv")
+    teachers = _table(beside, ["env", "teacher", "return"]) if beside.exists() else pd.DataFrame()
+    levels = {(row.env, row.teacher): row[-1] for row in teachers.itertuples(index=False)}
     means = {key: rows.set_index("metric")["mean"] for key, rows in training.groupby(KEY)} if len(training) else {}
     runs, left_out = [], []
     for key, rows in evaluations.groupby(KEY, sort=False):
@@ -39,18 +45,25 @@ def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
         runs.append(
             FinishedRun(
                 path=path,
-                env=str(env),
+                env=_env(str(env)),
                 degrade={"none": "", "good": "none"}.get(str(teacher), str(teacher)),
                 method=method,
                 seed=int(seed),
                 settings={},
                 evaluations=rows[["frames", "return"]].rename(columns={"return": "mean_return"}),
                 metrics=pd.DataFrame({"frames": [int(rows["frames"].iloc[-1])]} | measured),
+                teacher_return=levels.get((env, teacher)),
                 prior="" if teacher == "none" else f"{teacher} teacher",
                 label=str(label),
             )
         )
     return runs, left_out
+
+
+def _env(name: str) -> str:
+    """The environment of a file of ``conf/env``, as other reports call it; any other name as it is."""
+    file = _ENVS / f"{name}.yaml"
+    return env_name(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else name
 
 
 def _table(path: Path, needed: list[str]) -> pd.DataFrame:
@@ -60,8 +73,8 @@ def _table(path: Path, needed: list[str]) -> pd.DataFrame:
         raise ValueError(f"{path} is damaged: {error}") from None
     if absent := [name for name in needed if name not in table]:
         raise ValueError(f"{path} is no table of a study: it has no column {', '.join(absent)}.")
-    for name in needed[3:]:
-        if name != "metric":
+    for name in needed:
+        if name not in ("env", "teacher", "method", "metric"):
             values = pd.to_numeric(table[name], errors="coerce")
             if values.isna().any():
                 raise ValueError(f"{path}: {int(values.isna().sum())} values of {name} are no numbers.")

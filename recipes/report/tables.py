@@ -12,6 +12,7 @@ from recipes.report.config import ReportConfig
 from recipes.report.runs import FinishedRun
 from torchrl_priors.methods import METHODS
 from torchrl_priors.metrics import (
+    MIN_RUNS,
     ConfidenceInterval,
     area_ratio,
     area_under_curve,
@@ -66,6 +67,19 @@ class Study:
         """The methods with runs in an environment, the baselines included."""
         return [label for label in self.labels if self.runs(env, prior, label)]
 
+    def number(self, env: str, prior: str) -> str:
+        """How many runs the methods of a panel have."""
+        counts = sorted({len(self.runs(env, prior, label)) for label in self.methods(env, prior)})
+        return "-".join(str(count) for count in (counts if len(counts) == 1 else (counts[0], counts[-1])))
+
+    def teacher(self, env: str, prior: str) -> float | None:
+        """Return of the teacher of a panel, where it is known."""
+        known = [run.teacher_return for run in self._of_prior(env, prior) if run.teacher_return is not None]
+        return known[0] if known else None
+
+    def _of_prior(self, env: str, prior: str) -> list[FinishedRun]:
+        return [run for key, runs in self._groups.items() if key[:2] == (env, prior) for run in runs]
+
     def panels(self) -> Iterator[tuple[str, str]]:
         """Environments and priors to show side by side, prior by prior."""
         for prior in self.priors:
@@ -74,8 +88,10 @@ class Study:
                     yield env, prior
 
     def interval(self, scores: np.ndarray) -> ConfidenceInterval:
-        """IQM of ``[runs, tasks, *rest]`` and its stratified bootstrap interval."""
-        return stratified_bootstrap_ci(scores, iqm, **bootstrap(self.cfg))
+        """IQM of ``[runs, tasks, *rest]`` and its stratified bootstrap interval, NaN where there are too few runs."""
+        interval = stratified_bootstrap_ci(scores, iqm, **bootstrap(self.cfg))
+        none = np.full_like(interval.low, np.nan)
+        return interval if len(scores) >= MIN_RUNS else interval._replace(low=none, high=none)
 
     def ratios(self, env: str, prior: str, label: str) -> dict[int, float]:
         """Area ratio to the baseline by seed, its sign that of the gain: divided by the size of the baseline's area."""
@@ -200,6 +216,8 @@ def improvement_table(study: Study) -> pd.DataFrame:
                     for name, score in (("area", area), ("final", final)):
                         sides = ([[score(run) for run in row] for row in side] for side in (x, y))
                         found = probability_of_improvement(*sides, **bootstrap(study.cfg))
+                        if min(len(x), len(y)) < MIN_RUNS:
+                            found = found._replace(low=np.nan, high=np.nan)
                         rows.append((env, prior, label, reference, name, len(x), len(y), *found))
     columns = ["env", "prior", "method", "reference", "score", "runs", "reference_runs", "probability"]
     return pd.DataFrame(rows, columns=[*columns, "ci_low", "ci_high"])

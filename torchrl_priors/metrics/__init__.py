@@ -9,9 +9,10 @@ ran before.
 from torchrl_priors.metrics.area import RATIO_LIMIT, area_ratio, area_under_curve
 from torchrl_priors.metrics.bootstrap import iqm, mean_confidence_interval, stratified_bootstrap_ci
 from torchrl_priors.metrics.comparison import performance_profile, probability_of_improvement
-from torchrl_priors.metrics.interval import ConfidenceInterval
+from torchrl_priors.metrics.interval import MIN_RUNS, ConfidenceInterval
 
 __all__ = [
+    "MIN_RUNS",
     "RATIO_LIMIT",
     "ConfidenceInterval",
     "area_ratio",

@@ -7,10 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CHUNK", "Array", "ConfidenceInterval", "as_array", "as_scores", "interval", "tails", "unwrap"]
+__all__ = ["CHUNK", "MIN_RUNS", "Array", "ConfidenceInterval", "as_array", "as_scores", "interval", "tails", "unwrap"]
 
 CHUNK = 1 << 20
 """Numbers resampled at once: 8 MiB of indices, so that the working set stays in the caches."""
+
+MIN_RUNS = 4
+"""Runs below which the bootstrap's interval is far too narrow to be shown: three runs have ten different resamples."""
 
 Array = npt.NDArray[np.float64]
 

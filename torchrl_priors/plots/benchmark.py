@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
-from torchrl_priors.metrics import ConfidenceInterval, performance_profile
+from torchrl_priors.metrics import MIN_RUNS, ConfidenceInterval, performance_profile
 from torchrl_priors.plots.style import (
     BASELINE,
     COLUMN_WIDTH,
@@ -82,13 +82,12 @@ def return_curves(
     ylabel: str = "Return",
     baseline: str | None = None,
     ylim: tuple[float, float] | None = None,
-    outlined: bool = False,
     references: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Figure:
     """Curves with bands, a panel per environment (and prior), each with its own scale.
 
     Args:
-        panels: by title and method, a curve with its interval, arrays ``[points]``.
+        panels: by title and method, a curve with its interval, arrays ``[points]``; a NaN interval is not drawn.
         steps: by title, where the points are, ``[points]``; or by title and method, where curves have their own.
 
     Keyword Args:
@@ -96,8 +95,6 @@ def return_curves(
         xlabel, ylabel (str): names of the axes.
         baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
         ylim (tuple of float, optional): one scale for all panels.
-        outlined (bool): whether bands are drawn by their edges: quantiles, which overlap more than intervals do.
-            Defaults to ``False``.
         references: by title and name, a level to mark by a thin grey line with its name, e.g. the teacher's return.
 
     Returns:
@@ -118,7 +115,7 @@ def return_curves(
         for name, curve in curves.items():
             where = steps[title]
             x = np.asarray(where[name] if isinstance(where, Mapping) else where, dtype=np.float64)
-            _draw_band(ax, x, curve, styles[name], f"curve {name!r} of {title!r}", outlined)
+            _draw_band(ax, x, curve, styles[name], f"curve {name!r} of {title!r}")
         for name, level in (references or {}).get(title, {}).items():
             ax.axhline(level, color="0.45", linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1.8)
             ax.annotate(
@@ -156,7 +153,7 @@ def profile_panels(
 ) -> Figure:
     r"""Performance profiles, a panel per prior: the share of runs whose area ratio exceeds a threshold.
 
-    The dashed line marks 0, no improvement over the baseline.
+    The dashed line marks 0, no improvement over the baseline. A method with fewer than four runs has no band.
 
     Args:
         panels: by title and method, area ratios ``[runs]`` or ``[runs, tasks]``.
@@ -190,6 +187,8 @@ def profile_panels(
         ax.axvline(0, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
         for name, scores in profiles.items():
             band = performance_profile(scores, taus, confidence=confidence, reps=reps, seed=seed)
+            if len(scores) < MIN_RUNS:
+                band = band._replace(low=band.estimate, high=band.estimate)
             _draw_band(ax, taus, band, styles[name], f"profile of {name!r}")
         ax.set_title(title, linespacing=1.05)
         ax.set(xlim=(taus.min(), taus.max()), ylim=(0, 1))
@@ -213,7 +212,7 @@ def interval_panels(
     """Estimates as lines and their intervals as bars, a row per method and a panel per environment (and prior).
 
     Args:
-        panels: by title and method, an estimate with its interval, floats.
+        panels: by title and method, an estimate with its interval, floats; a NaN interval is not drawn.
 
     Keyword Args:
         center (float): the dashed line: 0 for a ratio, ½ for a probability. Defaults to 0.
@@ -281,16 +280,12 @@ def _panels(
     return figure, {cell: figure.add_subplot(grid[cell]) for cell in cells}
 
 
-def _draw_band(
-    ax: Axes, x: Any, band: ConfidenceInterval, style: dict[str, Any], name: str, outlined: bool = False
-) -> None:
+def _draw_band(ax: Axes, x: Any, band: ConfidenceInterval, style: dict[str, Any], name: str) -> None:
     middle, low, high = (np.asarray(values, dtype=np.float64) for values in band)
     if not x.shape == middle.shape == low.shape == high.shape:
         raise ValueError(f"The {name} has {middle.shape} points, its axis {x.shape}.")
     color = style["color"]
-    ax.fill_between(x, low, high, color=color, alpha=0.06 if outlined else 0.16, linewidth=0, zorder=2)
-    for edge in (low, high) if outlined else ():
-        ax.plot(x, edge, color=color, linewidth=0.6, linestyle=style["linestyle"], zorder=2.5)
+    ax.fill_between(x, low, high, color=color, alpha=0.16, linewidth=0, zorder=2)
     marker: dict[str, Any] = {"marker": "o", "markersize": 3} if len(x) == 1 else {}
     ax.plot(x, middle, solid_capstyle="round", **style, **marker)
 
