@@ -38,8 +38,10 @@ def _title(study: Study, env: str, prior: str) -> str:
 
 def _columns(study: Study) -> int | None:
     """Environments beside each other and priors below, where that makes a full table of panels."""
-    full = len(list(study.panels())) == len(study.envs) * len(study.priors)
-    return len(study.envs) if full and 1 < len(study.envs) <= 4 and len(study.priors) > 1 else None
+    panels = list(study.panels())
+    envs = len({env for env, _ in panels})
+    full = len(panels) == envs * len(study.priors)
+    return envs if full and 1 < envs <= 4 and len(study.priors) > 1 else None
 
 
 def curve_table(study: Study) -> pd.DataFrame:
