@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN = $(if $(wildcard $(VENV)/bin/python),$(VENV)/bin/,)
 
-.PHONY: setup check format docs test test-min
+.PHONY: setup check format docs inventories test test-min
 
 setup:  ## create .venv with everything a contributor needs
 	python3 -m venv $(VENV)
@@ -18,7 +18,10 @@ format:  ## apply the formatting and the safe lint fixes
 	$(BIN)ruff check --fix .
 
 docs:  ## the documentation, into site/; a warning is an error
-	$(BIN)python -m mkdocs build --strict
+	$(BIN)python -m sphinx -W --keep-going -b html docs site
+
+inventories:  ## where other projects document what docs/ refers to; needs the network
+	$(BIN)python docs/inventories.py
 
 test:  ## doctests and tests
 	$(BIN)python -m pytest -n auto

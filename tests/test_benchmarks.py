@@ -1,4 +1,4 @@
-"""The commands of the benchmarks run as the README has them, at the smallest sizes."""
+"""The commands of the benchmarks run as benchmarks/README.md has them, at the smallest sizes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def run(*command: str) -> None:
 
 
 def test_the_continuous_benchmark_runs(capfd: pytest.CaptureFixture[str]) -> None:
-    found = re.search(r"`python (benchmarks/continuous\.py[^`]*)`", (ROOT / "README.md").read_text())
+    found = re.search(r"`python (benchmarks/continuous\.py[^`]*)`", (ROOT / "benchmarks/README.md").read_text())
     assert found is not None
     arguments = shlex.split(found[1])
     assert "--rounds" in arguments
@@ -36,7 +36,7 @@ def test_the_continuous_benchmark_runs(capfd: pytest.CaptureFixture[str]) -> Non
 
 
 def test_the_gridworld_benchmark_runs(capfd: pytest.CaptureFixture[str]) -> None:
-    assert "`python benchmarks/gridworld.py`" in (ROOT / "README.md").read_text()
+    assert "`python benchmarks/gridworld.py`" in (ROOT / "benchmarks/README.md").read_text()
     run("benchmarks/gridworld.py", "--worlds", "1", "--rounds", "1")
     said = capfd.readouterr().out
     for line in ("worlds per CPU second", "ae2r", "the paper's table", "GiB"):

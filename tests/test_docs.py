@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -105,36 +105,72 @@ def test_every_method_has_a_page(method: str) -> None:
 
 def test_everything_public_is_in_the_api() -> None:
     shown: set[int] = set()
-    for path in re.findall(r"^::: ([\w.]+)$", "\n".join(PAGES.values()), flags=re.MULTILINE):
-        head, _, name = path.rpartition(".")
-        found = getattr(importlib.import_module(head), name, None)
-        if found is None or type(found).__name__ == "module":
+    api = "\n".join(path.read_text(encoding="utf-8") for path in (DOCS / "api").glob("*.rst"))
+    for kind, path in re.findall(r"^\.\. (auto\w+|py:data):: ([\w.]+)$", api, flags=re.MULTILINE):
+        if kind == "automodule":
             module = importlib.import_module(path)
             shown |= {id(getattr(module, public)) for public in module.__all__}
         else:
-            shown.add(id(found))
+            head, _, name = path.rpartition(".")
+            shown.add(id(getattr(importlib.import_module(head), name)))
     for package in ("torchrl_priors", "torchrl_priors.artifacts", "torchrl_priors.collectors"):
         module = importlib.import_module(package)
         assert [name for name in module.__all__ if id(getattr(module, name)) not in shown] == []
 
 
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
-    pytest.importorskip("mkdocs")
-    if shutil.which("mkdocs", path=str(Path(sys.executable).parent)) is None:
-        pytest.skip("mkdocs is not installed beside this Python")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built without a network and with warnings as errors."""
+    for package in ("sphinx", "myst_parser", "pydata_sphinx_theme", "latex2mathml"):
+        pytest.importorskip(package)
+    folder = tmp_path_factory.mktemp("site")
+    options = ["-W", "--keep-going", "-q", "-b", "html"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *options, str(DOCS), str(folder)],
+        cwd=ROOT,
+        env={**os.environ, "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
-    page = (tmp_path / "site/methods/ae2r/index.html").read_text(encoding="utf-8")
+    return folder
+
+
+def test_the_site_builds_without_a_warning(site: Path) -> None:
+    page = (site / "methods/ae2r.html").read_text(encoding="utf-8")
     formulas = re.findall("<math.*?</math>", page, flags=re.DOTALL)
     assert len(formulas) >= 5
     assert not any("\\" in formula or "&#x0005C;" in formula for formula in formulas)  # LaTeX that was not understood
-    assert "arithmatex" not in page
-    assert "<table>" in page
+    assert "$" not in re.sub("<(script|style).*?</\\1>", "", page, flags=re.DOTALL)
+    assert "<table" in page
 
 
-def test_no_page_needs_the_network() -> None:
-    """The theme loads neither fonts nor scripts of another host."""
-    config = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    assert "font: false" in config
-    assert "extra_javascript" not in config
+def test_a_docstring_refers_to_other_projects(site: Path) -> None:
+    page = (site / "api/objectives.html").read_text(encoding="utf-8")
+    assert "generated/torchrl.objectives.ClipPPOLoss.html#torchrl.objectives.ClipPPOLoss" in page
+    assert 'href="transforms.html#torchrl_priors.PriorBonus"' in page
+
+
+def test_no_page_needs_the_network(site: Path) -> None:
+    """Neither fonts nor scripts nor styles of another host are loaded."""
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        assert re.findall(r"""<(?:script|img|iframe)[^>]*\ssrc=["'](?:https?:)?//""", text) == [], page
+        assert re.findall(r"""<link[^>]*\shref=["'](?:https?:)?//""", text) == [], page
+    for style in site.rglob("*.css"):
+        assert re.findall(r"""(?:@import|url\()\s*["']?https?:""", style.read_text(encoding="utf-8")) == [], style
+
+
+def test_the_inventories_hold_what_is_used_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(str(DOCS))
+    inventories = importlib.import_module("inventories")
+    names = inventories.names_used()
+    for file in (DOCS / "_inventories").glob("*.txt"):
+        lines = file.read_text(encoding="utf-8").splitlines()
+        assert {line.split()[0] for line in lines if not line.startswith("#")} == {
+            name for name in names if name.startswith(f"{file.stem}.")
+        }, file
+        published = "\n".join([*lines, f"{file.stem}.never_used function page.html"]).encode()
+        assert inventories.selected(file.stem, published, names).splitlines() == lines

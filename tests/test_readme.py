@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor, nn
@@ -62,8 +63,9 @@ def same(before: dict[str, Tensor], after: dict[str, Tensor]) -> bool:
     return all(torch.equal(value, after[key]) for key, value in before.items())
 
 
-def test_the_example_trains_everything_but_the_teacher() -> None:
+def test_the_example_trains_everything_but_the_teacher(capsys: pytest.CaptureFixture[str]) -> None:
     names, before = run_example(code_below("tested: example"))
+    assert capsys.readouterr().out.count("prior weight") == 2
     unchanged = {name for name in before if name != "env" and same(before[name], names[name].state_dict())}
     assert unchanged == {"teacher"}
     assert {"loss_objective", "loss_critic", "loss_prior", "loss_prior_weight", "loss_prior_critic"} <= set(

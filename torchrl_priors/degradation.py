@@ -212,7 +212,7 @@ class RandomDegradation(Degradation):
 
     @property
     def draw_keys(self) -> list[NestedKey]:
-        """What the prior drew at random and left in the batch: its own draw last."""
+        """What the prior drew at random and left in the batch; its own draw is the last."""
         return [*super().draw_keys, self.draw_key]
 
     def draw(self, tensordict: TensorDictBase) -> None:

@@ -27,7 +27,7 @@ class PriorWeight(TensorDictModuleBase):
 
     Keyword Args:
         init_scale (float, optional): multiplies the weight of the last linear layer, now and at each
-            :meth:`reset_parameters_recursive`. Defaults to 0.01; ``None`` leaves ``net`` as it is, ``init_bias`` too.
+            ``reset_parameters_recursive``. Defaults to 0.01; ``None`` leaves ``net`` as it is, ``init_bias`` too.
         init_bias (float): the bias of that layer. A negative one starts with less trust. Defaults to 0.
 
     Raises:

@@ -42,7 +42,7 @@ class TrialResult(NamedTuple):
 class TeacherTrial:
     r"""Finds out whether a teacher helps, by trying: one student alone and one for each teacher, and their returns.
 
-    Beyond the paper. The loop trains every arm that is still :attr:`active` for the same number of frames, gives each
+    Beyond the paper. The loop trains every arm that is still ``active`` for the same number of frames, gives each
     batch to :meth:`update`, and calls :meth:`decide` after each round. Compared are the returns of *recent* episodes,
     those that ended in the last quarter of an arm's frames so far, for what a student does at first says little. With
     mean :math:`m` and variance :math:`s^2` of :math:`n` recent returns, an arm is behind another where

@@ -41,7 +41,7 @@ def load_sb3_prior(
     What the teacher's distribution is, in the unit of the environment's actions:
 
     * PPO, A2C, discrete actions: a :class:`~torch.distributions.Categorical` over indices, or, with ``one_hot``, a
-      :class:`~torchrl.modules.OneHotCategorical`, as the students of a :class:`~torchrl.envs.GymEnv` are by default;
+      :class:`~torchrl.modules.OneHotCategorical`, as the students of a :func:`~torchrl.envs.GymEnv` are by default;
     * PPO, A2C, continuous: a Gaussian, before the clipping to the bounds that Stable-Baselines3 does when it acts;
     * SAC: a :class:`~torchrl.modules.TanhNormal` within the bounds. Stable-Baselines3's own ``log_prob`` is that of
       actions scaled to [-1, 1], and adds 1e-6 to :math:`1-\tanh^2`; this one is exact;

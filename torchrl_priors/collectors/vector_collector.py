@@ -276,7 +276,7 @@ class VectorCollector:
         """All that the next rollout depends on, but for the policy: environments, random numbers, normaliser, counters.
 
         Tensors, numbers and strings only, in nested dicts, for :func:`torch.save` (with ``weights_only``) and
-        :mod:`torchrl.checkpoint`. Take it between rollouts. A collector that loads it, in this process or another,
+        ``torchrl.checkpoint``. Take it between rollouts. A collector that loads it, in this process or another,
         continues bit by bit, given the same policy, machine and versions.
 
         Raises:

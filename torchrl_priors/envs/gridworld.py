@@ -80,13 +80,13 @@ class GridWorldEnv(EnvBase):
     pays its reward; +-5 and +-10 are terminal, +-1 are not. With probability ``noise`` a uniform action replaces the
     agent's, and each step ends the episode with probability ``end_prob``.
 
-    Keys: ``observation`` uint8 ``[W, window, window]`` (kinds of cells, see :data:`~torchrl_priors.envs.worlds.KINDS`),
+    Keys: ``observation`` uint8 ``[W, window, window]`` (kinds of cells, see ``worlds.KINDS``),
     ``state`` int64 ``[W]`` (the number of the observation, for tables of ``C`` rows), ``position`` int64 ``[W]``,
     ``action`` int64 ``[W]``, ``reward`` float32 ``[W, 1]``. Random numbers come from a CPU generator of its own, so
     that a seed gives the same rollout on every device; the generator's state is part of the ``state_dict``.
 
     Args:
-        worlds (GridWorlds): from :func:`~torchrl_priors.envs.worlds.sample_worlds`.
+        worlds (GridWorlds): from :func:`sample_worlds`.
 
     Keyword Args:
         noise (float): probability that the action is replaced.

@@ -42,7 +42,7 @@ class CompiledStep:
     optimizer are those of the ordinary objects, which can be saved, loaded, scheduled and used without it at any time.
 
     What is recorded is one path through the code: a decision that the loss takes in Python by looking at data (such as
-    the checks of arguments in :mod:`torch.distributions`) is taken once. Look at the reported values to find NaNs.
+    the checks of arguments in ``torch.distributions``) is taken once. Look at the reported values to find NaNs.
 
     Args:
         loss (LossModule): of scalar losses, with ``functional=False`` where it has the choice.

@@ -132,7 +132,7 @@ class ActionPrior(TensorDictModuleBase):
         """The distribution over actions at the states of ``tensordict``, which stays as it is.
 
         Args:
-            tensordict (TensorDictBase): holds :attr:`in_keys`, batch ``[*B]``.
+            tensordict (TensorDictBase): holds ``in_keys``, batch ``[*B]``.
         """
         return self.build_dist(self.get_params(tensordict))
 
@@ -145,7 +145,7 @@ class ActionPrior(TensorDictModuleBase):
         r"""Log-probability of the action that was taken, :math:`\log\pi_0(a_t|s_t)`.
 
         Args:
-            tensordict (TensorDictBase): holds :attr:`in_keys` and the action, batch ``[*B]``.
+            tensordict (TensorDictBase): holds ``in_keys`` and the action, batch ``[*B]``.
 
         Keyword Args:
             dist (torch.distributions.Distribution, optional): from :meth:`get_dist`, to save its computation.
@@ -192,7 +192,7 @@ class ActionPrior(TensorDictModuleBase):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the parameters of the distribution under the namespace, in :attr:`out_keys`."""
+        """Writes the parameters of the distribution under the namespace, in ``out_keys``."""
         for key, value in zip(self.out_keys, self.get_params(tensordict).values(), strict=True):
             tensordict.set(key, value)
         return tensordict

@@ -25,7 +25,7 @@ class BoltzmannPrior(ActionPrior):
     r"""A softmax over action values, :math:`\pi_0(a|s) \propto \exp(Q(s,a)/\tau)`.
 
     The teacher of the paper's gridworlds (Centa & Preux, "Soft Action Priors"), with :math:`\tau=1`; its
-    :meth:`adversary` is :math:`\propto \exp(-Q(s,a)/\tau)`. A value of :math:`-\infty` says that an action is not
+    ``adversary()`` is :math:`\propto \exp(-Q(s,a)/\tau)`. A value of :math:`-\infty` says that an action is not
     available, for the adversary too.
 
     Args:

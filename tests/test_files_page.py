@@ -1,0 +1,99 @@
+"""``docs/guides/files.md`` explains every column and key that is written, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from mujoco_cases import run
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/guides/files.md").read_text(encoding="utf-8")
+GRIDWORLD, RUN, STUDY, REPORT, PAPER = (
+    "A gridworld study",
+    "A MuJoCo run",
+    "A study of MuJoCo runs",
+    "A report",
+    "The paper's numbers",
+)
+SMALL = "worlds=2 teacher.steps=200 teacher.eval_episodes=1 evaluation.points=3 evaluation.interval=20"
+
+
+def rows(text: str) -> set[str]:
+    """The names in the first column of the tables of columns and keys."""
+    tables = re.findall(r"^\| (?:column|key) \| meaning \|\n\|[-|]+\|\n((?:\|.*\n?)+)", text, flags=re.MULTILINE)
+    cells = [line.split("|")[1] for table in tables for line in table.strip().splitlines()]
+    return {name for cell in cells for name in re.findall(r"`([\w.]+)`", cell)}
+
+
+def explained() -> dict[tuple[str, str], tuple[set[str], set[str]]]:
+    """Names explained for a file of a section, and those explained for all files of the section."""
+    found = {}
+    for section in re.split(r"^## ", PAGE, flags=re.MULTILINE)[1:]:
+        title = section.splitlines()[0]
+        shared, *files = re.split(r"^### ", section, flags=re.MULTILINE)
+        for file in files:
+            found[title, file.splitlines()[0].strip("`")] = (rows(file), rows(shared))
+    return found
+
+
+def columns(section: str, folder: Path, rename: str | None = None) -> dict[tuple[str, str], set[str]]:
+    """The columns of the tables in a folder, by section and the file's name on the page."""
+    found: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for file in folder.glob("*.csv"):
+        name = file.name if rename is None else re.sub(rename, "<name>", file.name)
+        found[section, name] |= set(pd.read_csv(file).columns)
+    return found
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], set[str]]:
+    """The columns and keys of what is committed, and of tiny runs."""
+    folder = tmp_path_factory.mktemp("files")
+    teacher = f"prior.path={run(folder / 'none', 'method=none') / 'policy.safetensors'}"
+    run(folder / "ae2r", "method=ae2r", teacher, "schedule.methods=all")
+    run(folder / "trial", "method=trial", teacher, "trial.max_frames=64", "trial.min_frames=64")
+    with pytest.raises(SystemExit):
+        run(folder / "failed", "method=none", "ppo.lr=1e30")
+    command = [sys.executable, "-m", "recipes.gridworld", "study=small", *SMALL.split(), "bootstrap.reps=20"]
+    command.append(f"out={folder / 'gridworld'}")
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+
+    found: dict[tuple[str, str], set[str]] = defaultdict(set)
+    tables = [columns(RUN, folder / name) for name in ("none", "ae2r", "trial")]
+    tables += [columns(GRIDWORLD, folder / "gridworld")]
+    tables += [columns(GRIDWORLD, path) for path in (ROOT / "results/gridworld").iterdir() if path.is_dir()]
+    tables += [columns(STUDY, ROOT / "results/mujoco", rename=r"^[a-z]+(?=[_.])")]
+    tables += [columns(REPORT, path) for path in (ROOT / "results/mujoco").iterdir() if path.is_dir()]
+    tables += [columns(PAPER, ROOT / "recipes" / name) for name in ("gridworld", "report")]
+    for table in tables:
+        for key, names in table.items():
+            found[key] |= names
+    for name in ("none", "trial", "failed"):
+        found[RUN, "status.json"] |= set(json.loads((folder / name / "status.json").read_text()))
+    for trial in json.loads((folder / "trial/trials.json").read_text()):
+        found[RUN, "trials.json"] |= set(trial)
+    return found
+
+
+def test_the_page_has_every_file(written: dict[tuple[str, str], set[str]]) -> None:
+    assert set(written) == set(explained())
+
+
+@pytest.mark.parametrize("file", explained(), ids=" ".join)
+def test_the_page_has_every_column(file: tuple[str, str], written: dict[tuple[str, str], set[str]]) -> None:
+    own, shared = explained()[file]
+    assert written[file] - own - shared == set(), "not explained"
+    assert own - written[file] == set(), "never written"
+
+
+def test_shared_columns_are_written_somewhere(written: dict[tuple[str, str], set[str]]) -> None:
+    for (section, _), (_, shared) in explained().items():
+        names = set().union(*(columns for (other, _), columns in written.items() if other == section))
+        assert shared <= names, section
