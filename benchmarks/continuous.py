@@ -34,7 +34,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import DoubleToFloat, GymEnv, SerialEnv, TransformedEnv
 
 from recipes.mujoco_agent import Agent, Optimiser
-from torchrl_priors.artifacts import save_policy
+from torchrl_priors import policy_prior, save_prior
 from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate, make_vector_env
 from torchrl_priors.networks import make_actor
 
@@ -153,7 +153,7 @@ def main() -> None:
         cfg, env_id = baseline.cfg, baseline.env_id
         path = os.path.join(folder, "teacher.safetensors")
         norm = RunningNorm(baseline.agent.normalizer.mean.shape)
-        save_policy(path, baseline.agent.actor, norm, env_id=env_id, seed=0, frames=0, evaluation={}, training={})
+        save_prior(path, policy_prior(baseline.agent.actor, norm), env_id=env_id)
         recipes = {"none": baseline}
         for method in methods[1:]:
             recipes[method] = Recipe([*overrides, f"method={method}", f"prior.path={path}"])
