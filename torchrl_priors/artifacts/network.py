@@ -172,7 +172,7 @@ def _counts(value: Any) -> list[int]:
 def _positive(value: Any) -> float:
     if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
         raise _Expected("a positive number")
-    return value  # type: ignore[no-any-return]
+    return value
 
 
 def _flag(value: Any) -> bool:

@@ -101,9 +101,8 @@ def _build(parts: Any, scope: Scope, namespace: NestedKey = "prior") -> ActionPr
         raise ArtifactError(f"its kind of prior is unknown: {short(name)}")
     kind, _, read = _KINDS[name]
     entries = {entry: value for entry, value in parts.items() if entry != "prior"}
-    expected = [entry for entry in inspect.signature(read).parameters if entry != "scope"]
-    if entries.keys() != set(expected):
-        raise ArtifactError(f"a prior {name!r} has the entries {', '.join(expected)}, got {', '.join(entries)}")
+    if entries.keys() != set(_ENTRIES[name]):
+        raise ArtifactError(f"a prior {name!r} has the entries {', '.join(_ENTRIES[name])}, got {', '.join(entries)}")
     return kind(**read(scope, **entries), namespace=namespace)
 
 
@@ -229,3 +228,4 @@ _KINDS: dict[str, tuple[type[ActionPrior], Callable[..., Parts], Callable[..., d
     "uniform": (UniformPrior, _describe_uniform, _read_uniform),
     "mixture": (MixturePrior, _describe_mixture, _read_mixture),
 }
+_ENTRIES = {name: list(inspect.signature(read).parameters)[1:] for name, (*_, read) in _KINDS.items()}
