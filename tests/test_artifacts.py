@@ -32,6 +32,8 @@ from torchrl_priors.artifacts import ArtifactError, PriorManifest, read_manifest
 from torchrl_priors.collectors import RunningNorm
 from torchrl_priors.networks import make_actor, make_critic
 
+TEACHERS = sorted((Path(__file__).parents[1] / "results/mujoco/teachers").glob("*.safetensors"))
+
 
 @pytest.fixture
 def saved(tmp_path: Path) -> Saved:
@@ -68,6 +70,14 @@ class TestRoundTrip:
         loaded = load_prior(saved.path.with_name("mixture"))
         assert torch.equal(loaded.log_prob(batch), mixture.log_prob(batch))
         torch.testing.assert_close(loaded.log_prob(batch), load_prior(saved.path).log_prob(batch))
+
+    @pytest.mark.parametrize("path", TEACHERS, ids=lambda path: path.stem)
+    def test_the_teachers_of_the_results_are_files_of_this_release(self, path: Path, tmp_path: Path) -> None:
+        manifest = read_manifest(path)
+        told = {name: getattr(manifest, name) for name in ("env_id", "seed", "frames", "evaluation", "training")}
+        assert manifest.evaluation["frames"] == manifest.frames
+        save_prior(tmp_path / "again", load_prior(path), **told)
+        assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
     def test_manifest_is_what_was_told(self, tmp_path: Path) -> None:
         told: dict[str, Any] = {
