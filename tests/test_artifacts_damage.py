@@ -122,11 +122,8 @@ class TestForeignFiles:
     @pytest.mark.parametrize("version", [0, 1, 3, "1", None, True, 2.0])
     def test_another_version(self, saved: Saved, version: Any) -> None:
         saved.path.write_bytes(pack(*contents(saved.path), version=version))
-        again = "write it again by save_prior"
-        refused(
-            saved.path,
-            f"of version {version!r}, .*{again if type(version) is int and version == 1 else 'newer torchrl_priors'}",
-        )
+        what = "write it again by save_prior" if str(version) == "1" != version else "newer torchrl_priors"
+        refused(saved.path, f"of version {version!r}, .*{what}")
 
     def test_the_former_format_of_policies(self, saved: Saved) -> None:
         safetensors.torch.save_file({"w": torch.zeros(1)}, saved.path, {"torchrl_priors.policy": "{}"})
@@ -202,7 +199,7 @@ def linear() -> Any:
     return gaussian(TeacherInput((OBS,), statistics=(torch.zeros(OBS),) * 2), GaussianHead(OBS, 2))
 
 
-MEAN, LOGITS, SQUASHED, TABLE, UNIFORM = (STORABLE[name] for name in ("mean", "logits", "squashed", "table", "uniform"))
+SQUASHED, TABLE, UNIFORM = (STORABLE[name] for name in ("squashed", "table", "uniform"))
 FORGED = [
     (policy, tell(prior="pickle"), "its kind of prior is unknown: 'pickle'"),
     (policy, tell(prior="x" * 900_000), r"its kind of prior is unknown: 'xxx.*\.\.\..*xxx'"),
@@ -210,83 +207,49 @@ FORGED = [
     (policy, tell(output="action"), "Unknown output 'action'"),
     (policy, tell(output="mean"), r"missing: prior\.std"),
     (policy, tell(box=1), "its box must be true or false, got 1"),
-    (policy, tell(box=True), r"missing: prior\.low"),
     (policy, tell(in_keys=[3]), r"its in_keys must be lists of names, got \[3\]"),
     (policy, tell(extra=1), "a prior 'module' has the entries network, .*, got .*extra"),
     (policy, tell(network={"layer": "os.system"}), "its layer is unknown: 'os.system'"),
     (policy, tell(network=["tanh"]), r"a layer must be an object of JSON, got \['tanh'\]"),
-    (
-        policy,
-        tell(network={"layer": "linear", "size": 3}),
-        "a layer 'linear' has the options in_features, .*, got size",
-    ),
+    (policy, tell(network={"layer": "linear", "size": 3}), "a layer 'linear' has the options in_features, .*got size"),
     (policy, layer(1, activation="sin"), "activation of a layer 'gaussian_mlp' must be one of elu, .*, got 'sin'"),
-    (policy, layer(1, activation=["tanh"]), "activation of a layer 'gaussian_mlp' must be one of"),
     (policy, layer(1, obs_dim=0), "obs_dim of a layer 'gaussian_mlp' must be a positive integer, got 0"),
-    (policy, layer(1, obs_dim=4.0), "obs_dim of a layer 'gaussian_mlp' must be a positive integer, got 4.0"),
-    (policy, layer(1, act_dim=True), "act_dim of a layer 'gaussian_mlp' must be a positive integer, got True"),
-    (policy, layer(1, hidden=8), "hidden of a layer 'gaussian_mlp' must be a list of at most 100 sizes, got 8"),
     (policy, layer(1, hidden=[1] * 101), "hidden of a layer 'gaussian_mlp' must be a list of at most 100 sizes"),
     (policy, layer(1, hidden=[8, -8]), r"hidden of a layer .* must be a positive integer, got \[8, -8\]"),
-    (policy, layer(1, hidden=[8, "8"]), r"hidden of a layer .* must be a positive integer, got \[8, '8'\]"),
-    (policy, layer(0, shape=True), "shape of a layer 'running_norm' must be a list"),
     (policy, layer(0, clip=-1), "clip of a layer 'running_norm' must be a positive number, got -1"),
-    (policy, layer(0, eps="0"), "eps of a layer 'running_norm' must be a positive number, got '0'"),
     (policy, layer(0, eps=10**400), "eps of a layer 'running_norm' must be a positive number, got 1000"),
     # well formed, but not what the tensors are
     (
         policy,
         layer(1, obs_dim=5),
-        rf"{NETWORK}1\.mean\.0\.weight must be torch.float32 of shape \(8, 5\), got .* \(8, 4\)",
+        r"prior\.network\.1.mean.0.weight must be torch.float32 of shape \(8, 5\), got .*8, 4",
     ),
-    (policy, layer(1, act_dim=2**30), "must be torch.float32 of shape"),
     (policy, layer(1, hidden=[8]), rf"missing or unexpected: {NETWORK}1\.mean\.4\.bias"),
     (policy, layer(1, hidden=[2**30, 2**30]), "must be torch.float32 of shape"),
-    (
-        policy,
-        tell(network={"layer": "linear", "in_features": 2**30, "out_features": 2**30, "bias": None}),
-        "missing or",
-    ),
     # tensors that are not those of the description
     (policy, lambda _, tensors: tensors.pop(SCALE), f"missing or unexpected: {SCALE}"),
-    (policy, put(f"{NETWORK}1.mean.9.weight", [0.0]), rf"missing or unexpected: {NETWORK}1\.mean\.9\.weight"),
-    (policy, put("more", [0.0]), "unexpected: more"),
     (policy, put("a\x1b[2J", [0.0]), r"unexpected: a\\x1b\[2J\."),
     (policy, put(f"{NETWORK}a\x1b[2J", [0.0]), r"unexpected: prior\.network\.a\\x1b\[2J\."),
     (policy, put(SCALE, torch.zeros(ACTIONS + 1)), rf"{SCALE} must be torch.float32 of shape \(3,\)"),
     (policy, put(SCALE, torch.zeros(ACTIONS), torch.float64), "got torch.float64"),
-    (policy, put(SCALE, torch.zeros(ACTIONS), torch.bfloat16), "got torch.bfloat16"),
-    (policy, put(SCALE, torch.zeros(0)), f"{SCALE} is empty: it is of shape"),
     (policy, put(SCALE, [math.nan] * ACTIONS), f"{SCALE} is not finite"),
-    (policy, put(f"{NETWORK}1.mean.0.bias", [-math.inf] * 8), "not finite"),
-    (policy, put(f"{NETWORK}0.mean", [math.nan] * OBS, torch.float64), "not finite"),
-    (policy, put(f"{NETWORK}0.mean", [0.0] * OBS), "must be torch.float64"),
-    (MEAN, put(f"{NETWORK}0.bias", [math.nan] * 8), rf"{NETWORK}0\.bias is not finite"),
     (UNIFORM, put("prior.logits", torch.zeros(0, 2**40)), r"is empty: it is of shape \(0, "),
     (UNIFORM, put("prior.logits", torch.zeros(1, 4)), r"one dimension, got shape \(1, 4\)"),
     (TABLE, put("prior.q.table", torch.zeros(2**40, 0)), r"is empty: it is of shape \(1099"),
     # numbers that make what is none
     (policy, put(SCALE, [0.0, 0.0, 1000.0]), "exponentials of state_independent_scale, overflow or vanish"),
-    (policy, put(SCALE, [0.0, 0.0, -1000.0]), "exponentials of state_independent_scale, overflow or vanish"),
     (policy, put(f"{NETWORK}0.var", [-1.0] * OBS, torch.float64), "negative variance"),
     (policy, put(f"{NETWORK}0.count", -1.0, torch.float64), "negative count"),
     (policy, put(f"{NETWORK}0.mean", [1e300] * OBS, torch.float64), "statistics of its observations overflow"),
     (own_std, put(f"{NETWORK}1.log_std", [0.0, 1000.0]), "exponentials of log_std, overflow or vanish"),
-    (own_std, put(f"{NETWORK}1.log_std", [0.0, -1000.0]), "exponentials of log_std, overflow or vanish"),
     (linear, put(f"{NETWORK}0.var", [-1.0] * OBS, torch.float64), "negative variance"),
     *(
-        (
-            linear,
-            layer(1, log_std_range=list(values)),
-            "log_std_range of a layer 'gaussian_head' must be a lower and an",
-        )
+        (linear, layer(1, log_std_range=list(values)), "log_std_range of a layer 'gaussian_head' must be a lower and")
         for values in (("nan", "inf"), (2, -20), (-20, 1000), (-1000, -999), (True, True), (1,))
     ),
     (linear, layer(0, statistics=[[OBS]]), "statistics of a layer 'teacher_input' must be null, or the shapes of a"),
     (SQUASHED, put("prior.low", [-math.inf] * ACTIONS), r"bounds of its actions, prior\.low and high, must be finite"),
     (SQUASHED, put("prior.low", [3.0] * ACTIONS), "the lower ones below the upper ones"),
-    (SQUASHED, put("prior.low", [0.0]), "bounds of its actions"),
-    (STORABLE["box"], put("prior.high", [math.nan, 1.0]), "bounds of its actions"),
     (TABLE, tell(temperature=1e-300), "its temperature must be a positive number, got 1e-300"),
     (TABLE, tell(temperature="1"), "its temperature must be a positive number, got '1'"),
     (TABLE, tell(temperature=1e-40), "overflow at temperature 1e-40"),
@@ -304,23 +267,10 @@ def test_what_does_not_fit_or_gives_no_numbers_or_fills_the_memory_or_the_screen
     refused(tmp_path / "prior", match)
 
 
-class TestNothingIsUnpickled:
-    class Bomb:
-        def __reduce__(self) -> Any:
-            return Path.touch, (Path("unpickled"),)
+def test_reading_uses_no_pickle(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("pickle was used")
 
-    def test_pickled_files_are_refused_unread(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
-        (tmp_path / "plain.pkl").write_bytes(pickle.dumps(self.Bomb()))
-        torch.save(self.Bomb(), tmp_path / "torch.pt")
-        for name in ("plain.pkl", "torch.pt"):
-            refused(tmp_path / name, "not a safetensors file")
-        assert not (tmp_path / "unpickled").exists()
-
-    def test_reading_uses_no_pickle(self, saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
-        def fail(*args: Any, **kwargs: Any) -> None:
-            raise AssertionError("pickle was used")
-
-        for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
-            monkeypatch.setattr(module, name, fail)
-        load_prior(saved.path)
+    for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
+        monkeypatch.setattr(module, name, fail)
+    load_prior(saved.path)
