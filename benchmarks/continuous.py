@@ -35,7 +35,7 @@ from torchrl.envs import DoubleToFloat, GymEnv, SerialEnv, TransformedEnv
 
 from recipes.mujoco.agent import Agent, Optimiser
 from recipes.mujoco.task import open_task
-from torchrl_priors.artifacts import save_policy
+from torchrl_priors import policy_prior, save_prior
 from torchrl_priors.collectors import RunningNorm, VectorCollector, evaluate
 from torchrl_priors.networks import make_actor
 
@@ -157,7 +157,7 @@ def main() -> None:
         cfg, env_id = baseline.cfg, baseline.env_id
         path = os.path.join(folder, "teacher.safetensors")
         norm = RunningNorm(baseline.agent.normalizer.mean.shape)
-        save_policy(path, baseline.agent.actor, norm, env_id=env_id, seed=0, frames=0, evaluation={}, training={})
+        save_prior(path, policy_prior(baseline.agent.actor, norm), env_id=env_id)
         recipes = {"none": baseline}
         for method in methods[1:]:
             recipes[method] = Recipe([*overrides, f"method={method}", f"prior.path={path}"])

@@ -1,4 +1,4 @@
-"""Damaged and foreign files, from a seed: what a loader of policies must refuse."""
+"""Damaged and foreign files, from a seed: what a loader of priors must refuse."""
 
 from __future__ import annotations
 
@@ -22,9 +22,7 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from torchrl_priors.artifacts.format import _NO_DIGEST, _seal, pack
-
-ENTRY = "torchrl_priors.policy"
+from torchrl_priors.artifacts.format import _NO_DIGEST, KIND, _seal, pack
 
 
 class Bomb:
@@ -88,8 +86,8 @@ def sealed(text: str, tensors: bytes) -> bytes:
 def forged_headers(data: bytes, draw: random.Random) -> Iterator[tuple[str, bytes]]:
     """Headers that lie about the tensors below them, with a digest that is right."""
     header, tensors = header_of(data)
-    about = json.loads(header["__metadata__"][ENTRY])
-    header["__metadata__"][ENTRY] = json.dumps({**about, "sha256": _NO_DIGEST})
+    about = json.loads(header["__metadata__"][KIND])
+    header["__metadata__"][KIND] = json.dumps({**about, "sha256": _NO_DIGEST})
     names = [name for name in header if name != "__metadata__"]
     huge = [-1, 2**31, 2**40, 2**62, 2**64, 10**30, 0.5, None, "3", []]
     for _ in range(120):
@@ -106,13 +104,24 @@ def forged_headers(data: bytes, draw: random.Random) -> Iterator[tuple[str, byte
             first, second = draw.sample(names, 2)
             lying[first], lying[second] = lying[second], lying[first]
             if lying[first]["shape"] == lying[second]["shape"]:
-                continue  # a permutation of equal tensors is another good policy
+                continue  # a permutation of equal tensors is another good prior
         else:
             del entry[draw.choice(list(entry))]
         yield "header", sealed(json.dumps(lying), tensors)
     for name in names:  # the same name twice
         text = json.dumps(header)
         yield "duplicate", sealed(text[:-1] + f", {json.dumps(name)}: {json.dumps(header[names[0]])}}}", tensors)
+
+
+def entries(values: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The entries of a manifest and of all objects in it, each with the object that has it."""
+    if isinstance(values, dict):
+        for name in list(values):
+            yield name, values
+            yield from entries(values[name])
+    elif isinstance(values, list):
+        for value in values:
+            yield from entries(value)
 
 
 def forged_manifests(data: bytes, manifest: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
@@ -138,20 +147,28 @@ def forged_manifests(data: bytes, manifest: dict[str, Any]) -> Iterator[tuple[st
         "frames": (None, 10**400),
         "evaluation": ({"__class__": "os.system"},),
         "training": ({"__class__": "os.system"},),
+        "eps": (1.5, 1e308),
+        "clip": (1.5, 1e308),
+        "temperature": (1.5,),
     }
-    for entry in manifest:
+    for entry, values in entries(manifest):
+        honest = values.pop(entry)
+        yield f"without {entry}", pack(tensors, manifest)
         for value in junk:
-            if not any(value is good or value == good for good in fine.get(entry, ())):
-                yield f"manifest {entry}", pack(tensors, {**manifest, entry: value})
-        yield f"without {entry}", pack(tensors, {name: value for name, value in manifest.items() if name != entry})
-    for normalizer in ({"eps": 10**400, "clip": 1}, {"eps": 1, "clip": -1}, {"eps": 1}, {"eps": 1, "clip": 1, "x": 1}):
-        yield "normalizer", pack(tensors, {**manifest, "normalizer": normalizer})
+            if not any(type(value) is type(good) and value == good for good in (honest, *fine.get(entry, ()))):
+                values[entry] = value
+                yield f"manifest {entry}", pack(tensors, manifest)
+        values[entry] = honest
     for hidden in ([1] * 1000, [2**62], [0], [-1], ["8"], [8.0], [True]):
-        yield "hidden", pack(tensors, {**manifest, "hidden": hidden})
-    for version in (0, 2, 3, -1, 10**400, 1.0, True, "1", None, [], {}):
-        yield "version", pack(tensors, manifest, version=version)  # type: ignore[arg-type]
+        for _, values in entries(manifest):
+            if "hidden" in values:
+                honest, values["hidden"] = values["hidden"], hidden
+                yield "hidden", pack(tensors, manifest)
+                values["hidden"] = honest
+    for version in (0, 1, 3, -1, 10**400, 1.0, True, "1", None, [], {}):
+        yield "version", pack(tensors, manifest, version=version)
     for about in ("", "1", "[]", "null", "{}", "{", '"x"', "[" * 100_000, '{"a":' * 50_000, '{"version": NaN}', "\0"):
-        yield "about", safetensors.torch.save(tensors, {ENTRY: about})
+        yield "about", safetensors.torch.save(tensors, {KIND: about})
 
 
 def forged_tensors(data: bytes, manifest: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
@@ -176,7 +193,7 @@ def forged_tensors(data: bytes, manifest: dict[str, Any]) -> Iterator[tuple[str,
         rest = {key: other for key, other in tensors.items() if key != name}
         yield f"{name} missing", pack(rest, manifest)
         yield f"{name} renamed", pack({**rest, f"{name}\x1b[2J": value}, manifest)
-    scale = "actor.scale.state_independent_scale"
+    scale = "prior.network.1.scale.state_independent_scale"
     for value in (-1e4, 1e4):  # finite, but not a standard deviation
         yield "scale", pack({**tensors, scale: torch.full_like(tensors[scale], value)}, manifest)
     yield "no tensor", pack({}, manifest)
@@ -228,7 +245,13 @@ def foreign(folder: Path) -> Iterator[tuple[str, bytes]]:
     for text in (*texts, "a: !!python/object/apply:os.system [x]"):
         for encoding in ("utf-8", "utf-16", "utf-32"):
             yield "text", text.encode(encoding)
-    for metadata in (None, {"format": "pt"}, {"format": "np", "sha256": "0" * 64}, {ENTRY + ".v2": "{}"}):
+    for metadata in (
+        None,
+        {"format": "pt"},
+        {"format": "np", "sha256": "0" * 64},
+        {KIND + ".v2": "{}"},
+        {"torchrl_priors.policy": "{}"},
+    ):
         for dtype in (torch.float32, torch.bfloat16, torch.int64, torch.bool):
             yield "safetensors", safetensors.torch.save({"model.weight": torch.zeros(2, 2, dtype=dtype)}, metadata)
     for header in (
@@ -236,7 +259,7 @@ def foreign(folder: Path) -> Iterator[tuple[str, bytes]]:
         "[]",
         "1",
         '{"__metadata__": []}',
-        '{"__metadata__": {"torchrl_priors.policy": 1}}',
+        '{"__metadata__": {"torchrl_priors.prior": 1}}',
         "{" * 10_000,
         "[" * 100_000,
     ):
@@ -257,23 +280,23 @@ def not_files(folder: Path) -> Iterator[Path]:
     yield folder / "nothing"
 
 
-def write_corpus(folder: Path, good: bytes, manifest: dict[str, Any], prior: bytes, seed: int) -> None:
-    """Numbered files, of a policy and a prior, that must all be refused; none is a good file by chance."""
+def write_corpus(folder: Path, policy: bytes, mixture: bytes, manifests: list[dict[str, Any]], seed: int) -> None:
+    """Numbered files, of a policy and a mixture, that must all be refused; none is a good file by chance."""
     draw = random.Random(seed)
     kinds = [
-        damaged(good, draw),
-        itertools.islice(damaged(prior, draw), 0, None, 4),  # enough: what differs is below the digest
-        forged_headers(good, draw),
-        forged_manifests(good, manifest),
-        forged_tensors(good, manifest),
+        damaged(policy, draw),
+        itertools.islice(damaged(mixture, draw), 0, None, 4),  # enough: what differs is below the digest
+        forged_headers(policy, draw),
+        *map(forged_manifests, (policy, mixture), manifests),
+        forged_tensors(policy, manifests[0]),
         foreign(folder),
     ]
     number = 0
     for kind in kinds:
         for label, data in kind:
-            if data not in (good, prior):
+            if data not in (policy, mixture):
                 (folder / f"{number:04d} {label}").write_bytes(data)
                 number += 1
     with (folder / f"{number:04d} sparse").open("wb") as file:  # a good file that claims to need 64 GiB
-        file.write(good)
+        file.write(policy)
         file.truncate(2**36)

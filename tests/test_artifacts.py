@@ -1,4 +1,4 @@
-"""Policies in files: what comes back is what was saved, and what can't be saved is refused."""
+"""Priors in files: what comes back is what was saved, and what can't be saved is refused."""
 
 from __future__ import annotations
 
@@ -12,16 +12,27 @@ from typing import Any
 
 import pytest
 import torch
-from artifacts_cases import ACTIONS, OBS, Saved, act, raw_batch, save, trained
+from artifacts_cases import ACTIONS, OBS, STORABLE, Saved, net, raw_batch, save, trained
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import IndependentNormal, MaskedOneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_priors.artifacts import PolicyManifest, load_policy, load_prior, read_manifest, save_policy
-from torchrl_priors.collectors.running_norm import RunningNorm
+from torchrl_priors import (
+    ActionPrior,
+    AffordancePrior,
+    CallablePrior,
+    MixturePrior,
+    ModulePrior,
+    UniformPrior,
+    load_prior,
+    policy_prior,
+    save_prior,
+)
+from torchrl_priors.artifacts import ArtifactError, PriorManifest, read_manifest
+from torchrl_priors.collectors import RunningNorm
 from torchrl_priors.networks import make_actor, make_critic
+
+TEACHERS = sorted((Path(__file__).parents[1] / "results/mujoco/teachers").glob("*.safetensors"))
 
 
 @pytest.fixture
@@ -29,19 +40,44 @@ def saved(tmp_path: Path) -> Saved:
     return save(tmp_path / "teacher.safetensors")
 
 
+def advice(prior: ActionPrior) -> torch.Tensor:
+    return prior.get_dist(raw_batch(3).zero_()).mean
+
+
 class TestRoundTrip:
-    @pytest.mark.parametrize(
-        "kwargs", [{}, {"hidden": (8,)}, {"hidden": ()}, {"hidden": (5, 6, 7), "activation": "elu"}]
-    )
-    def test_same_actions(self, tmp_path: Path, kwargs: dict[str, Any]) -> None:
-        actor, normalizer = trained(**kwargs)
-        save_policy(tmp_path / "policy", actor, normalizer, env_id="Hopper-v5")
-        batch = raw_batch(7)
-        expected = act(actor, normalizer, batch)
-        got = act(*load_policy(tmp_path / "policy")[:2], batch)
-        assert set(got.keys()) == set(expected.keys())
-        for key, value in expected.items():
-            assert torch.equal(got[key], value), key
+    @pytest.mark.parametrize("name", STORABLE)
+    def test_same_advice_and_same_bytes(self, name: str, tmp_path: Path) -> None:
+        prior = STORABLE[name]()
+        save_prior(tmp_path / "prior", prior, env_id="Toy-v0")
+        loaded = load_prior(tmp_path / "prior", namespace="other", env_id="Toy-v0")
+        assert type(loaded) is type(prior)
+        assert loaded.in_keys == prior.in_keys
+        x = torch.randn(2, 6, OBS)
+        batch = TensorDict(
+            observation=x, agent=TensorDict(observation=x, batch_size=[2, 6]), state=torch.randint(5, (2, 6)),
+            pixels=torch.randint(256, (2, 6, 1, 36, 36), dtype=torch.uint8), batch_size=[2, 6],
+        )  # fmt: skip
+        batch["action"] = prior.get_dist(batch).sample()
+        assert torch.equal(loaded.log_prob(batch), prior.log_prob(batch))
+        assert all(torch.equal(value, loaded.get_params(batch)[key]) for key, value in prior.get_params(batch).items())
+        save_prior(tmp_path / "again", loaded, env_id="Toy-v0")
+        assert (tmp_path / "again").read_bytes() == (tmp_path / "prior").read_bytes()
+
+    def test_a_loaded_prior_is_saved_in_a_mixture(self, saved: Saved) -> None:
+        mixture = MixturePrior([load_prior(saved.path), load_prior(saved.path)])
+        save_prior(saved.path.with_name("mixture"), mixture, env_id="Hopper-v5")
+        batch = raw_batch(7).set("action", torch.randn(7, ACTIONS))
+        loaded = load_prior(saved.path.with_name("mixture"))
+        assert torch.equal(loaded.log_prob(batch), mixture.log_prob(batch))
+        torch.testing.assert_close(loaded.log_prob(batch), load_prior(saved.path).log_prob(batch))
+
+    @pytest.mark.parametrize("path", TEACHERS, ids=lambda path: path.stem)
+    def test_the_teachers_of_the_results_are_files_of_this_release(self, path: Path, tmp_path: Path) -> None:
+        manifest = read_manifest(path)
+        told = {name: getattr(manifest, name) for name in ("env_id", "seed", "frames", "evaluation", "training")}
+        assert manifest.evaluation["frames"] == manifest.frames
+        save_prior(tmp_path / "again", load_prior(path), **told)
+        assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
     def test_manifest_is_what_was_told(self, tmp_path: Path) -> None:
         told: dict[str, Any] = {
@@ -51,166 +87,141 @@ class TestRoundTrip:
             "evaluation": {"mean_return": 1828.25, "episodes": 50, "stochastic": True},
             "training": {"method": "none", "lr": 3e-4, "env": {"id": "Hopper-v5", "kwargs": {}}, "note": "é ☃ 0" * 3},
         }
-        actor, _ = trained(hidden=(8, 6), activation="relu")
-        manifest = save_policy(tmp_path / "policy", actor, RunningNorm(OBS, eps=1e-5, clip=5.0), **told)
-        assert manifest == read_manifest(tmp_path / "policy") == load_policy(tmp_path / "policy")[2]
-        assert manifest == PolicyManifest(
-            obs_dim=OBS,
-            act_dim=ACTIONS,
-            hidden=(8, 6),
-            activation="relu",
-            normalizer={"eps": 1e-5, "clip": 5.0},
-            **told,
-        )
+        prior = policy_prior(trained(hidden=(8, 6), activation="relu")[0], RunningNorm(OBS, eps=1e-5, clip=5.0))
+        manifest = save_prior(tmp_path / "prior", prior, **told)
+        assert manifest == read_manifest(tmp_path / "prior") == PriorManifest(prior=manifest.prior, **told)
+        assert manifest.prior["network"]["layers"] == [
+            {"layer": "running_norm", "shape": [OBS], "eps": 1e-5, "clip": 5.0},
+            {"layer": "gaussian_mlp", "obs_dim": OBS, "act_dim": ACTIONS, "hidden": [8, 6], "activation": "relu"},
+        ]
+        assert manifest == replace(manifest)
+        with pytest.raises(AttributeError):
+            manifest.seed = 1  # type: ignore[misc]
 
-    def test_normalizer_comes_back_whole_and_frozen(self, tmp_path: Path) -> None:
-        actor, normalizer = trained()
-        normalizer.clip, normalizer.eps = 0.5, 0.1
-        save_policy(tmp_path / "policy", actor, normalizer, env_id="Hopper-v5")
-        loaded = load_policy(tmp_path / "policy")[1]
-        for name, value in normalizer.state_dict().items():
-            assert torch.equal(loaded.state_dict()[name], value), name
-            assert loaded.state_dict()[name].dtype is torch.float64
-        observation = raw_batch(9)["observation"]
-        assert torch.equal(loaded(observation), normalizer(observation))
-        with pytest.raises(RuntimeError, match="frozen"):
-            loaded.update(observation)
-
-    def test_policy_of_raw_observations_needs_no_statistics(self, tmp_path: Path) -> None:
-        actor, _ = trained()
-        save_policy(tmp_path / "policy", actor, None, env_id="Hopper-v5")
-        loaded, normalizer, manifest = load_policy(tmp_path / "policy")
-        assert normalizer is None
-        assert manifest.normalizer is None
-        batch = raw_batch(7)
-        assert torch.equal(act(loaded, None, batch)["action"], act(actor, None, batch)["action"])
-        assert torch.equal(load_prior(tmp_path / "policy").get_dist(batch).mean, act(actor, None, batch)["loc"])
-
-    def test_loaded_policy_goes_on_learning(self, saved: Saved) -> None:
-        actor, normalizer, _ = load_policy(saved.path)
-        before = [parameter.clone() for parameter in actor.parameters()]
-        optimizer = torch.optim.SGD(actor.parameters(), lr=0.1)
-        dist = actor.get_dist(TensorDict(observation_norm=normalizer(raw_batch(7)["observation"]), batch_size=[7]))
-        dist.log_prob(torch.ones(7, ACTIONS)).sum().backward()
-        optimizer.step()
-        for parameter, old in zip(actor.parameters(), before, strict=True):
-            assert not torch.equal(parameter, old)
-
-    def test_saving_copies(self, saved: Saved) -> None:
-        expected = act(*load_policy(saved.path)[:2], raw_batch(3).zero_())
+    def test_saving_copies(self, tmp_path: Path) -> None:
+        network = net()
+        save_prior(tmp_path / "prior", ModulePrior(network, "mean", std=1.0), env_id="Toy-v0")
+        expected = advice(load_prior(tmp_path / "prior"))
         with torch.no_grad():
-            next(saved.actor.parameters()).add_(1)
-        saved.normalizer.update(torch.ones(5, OBS))
-        assert torch.equal(act(*load_policy(saved.path)[:2], raw_batch(3).zero_())["action"], expected["action"])
+            network[0].weight.add_(1)
+        assert torch.equal(advice(load_prior(tmp_path / "prior")), expected)
 
-    def test_same_policy_gives_the_same_bytes(self, saved: Saved) -> None:
-        again = saved.path.with_name("again")
-        actor, normalizer, _ = load_policy(saved.path, in_key="elsewhere")
-        save_policy(again, actor, normalizer, env_id="Hopper-v5")
-        assert again.read_bytes() == saved.path.read_bytes()
+    def test_another_key_can_be_read(self, saved: Saved) -> None:
+        batch = raw_batch(6)
+        expected = load_prior(saved.path).get_dist(batch).mean
+        moved = TensorDict({"agent": {"pixels": batch["observation"]}}, batch_size=[6])
+        prior = load_prior(saved.path, in_key=("agent", "pixels"))
+        assert prior.in_keys == [("agent", "pixels")]
+        assert torch.equal(prior.get_dist(moved).mean, expected)
+
+    @pytest.mark.parametrize("name", ["mixture_of_policies", "table", "q_network", "affordances"])
+    def test_another_key_can_be_read_by_every_part(self, name: str, tmp_path: Path) -> None:
+        save_prior(tmp_path / "prior", STORABLE[name](), env_id="Toy-v0")
+        assert load_prior(tmp_path / "prior", in_key="elsewhere").in_keys == ["elsewhere"]
+
+    def test_one_key_does_not_replace_two(self, tmp_path: Path) -> None:
+        save_prior(tmp_path / "prior", STORABLE["mixture"](), env_id="Toy-v0")
+        with pytest.raises(ArtifactError, match="in_key can't replace"):
+            load_prior(tmp_path / "prior", in_key="pixels")
 
     def test_loads_on_the_device_that_is_asked_for(self, saved: Saved) -> None:
-        actor, normalizer, _ = load_policy(saved.path, device="meta")
-        assert normalizer is not None
-        for value in (*actor.state_dict().values(), *normalizer.state_dict().values()):
-            assert value.device.type == "meta"
+        values = load_prior(saved.path, device="meta").state_dict().values()
+        assert {value.device.type for value in values} == {"meta"}
 
     def test_loading_draws_no_random_number(self, saved: Saved) -> None:
         before = torch.get_rng_state()
         load_prior(saved.path)
         assert torch.equal(torch.get_rng_state(), before)
 
+    def test_the_default_precision_does_not_matter(self, saved: Saved) -> None:
+        expected, before = advice(load_prior(saved.path)), torch.get_default_dtype()
+        torch.set_default_dtype(torch.float64)
+        try:
+            found = load_prior(saved.path).get_dist(TensorDict(observation=torch.zeros(3, OBS), batch_size=[3])).mean
+        finally:
+            torch.set_default_dtype(before)
+        assert torch.equal(found, expected)
+
     def test_parameters_may_be_views_of_one_buffer(self, saved: Saved) -> None:
         flat = torch.nn.utils.parameters_to_vector(saved.actor.parameters()).detach().clone()
         torch.nn.utils.vector_to_parameters(flat, saved.actor.parameters())
-        save_policy(saved.path.with_name("again"), saved.actor, saved.normalizer, env_id="Hopper-v5")
-        assert saved.path.with_name("again").read_bytes() == saved.path.read_bytes()
-
-    def test_manifest_may_hold_what_looks_like_an_empty_digest(self, tmp_path: Path) -> None:
-        save_policy(tmp_path / "policy", *trained(), env_id="0" * 64, training={"0" * 64: "0" * 640})
-        assert read_manifest(tmp_path / "policy").env_id == "0" * 64
+        again = saved.path.with_name("again")
+        save_prior(again, policy_prior(saved.actor, saved.normalizer), env_id="Hopper-v5")
+        assert again.read_bytes() == saved.path.read_bytes()
 
     def test_functional_losses_leave_the_actor_fit_to_be_saved(self, saved: Saved) -> None:
         loss = ClipPPOLoss(saved.actor, make_critic(OBS), functional=True)
         assert any(parameter.requires_grad for parameter in loss.parameters())
-        save_policy(saved.path.with_name("again"), saved.actor, saved.normalizer, env_id="Hopper-v5")
-        assert saved.path.with_name("again").read_bytes() == saved.path.read_bytes()
+        again = saved.path.with_name("again")
+        save_prior(again, policy_prior(saved.actor, saved.normalizer), env_id="Hopper-v5")
+        assert again.read_bytes() == saved.path.read_bytes()
+
+    def test_manifest_may_hold_what_looks_like_an_empty_digest(self, tmp_path: Path) -> None:
+        save_prior(tmp_path / "prior", UniformPrior(2), env_id="0" * 64, training={"0" * 64: "0" * 640})
+        assert read_manifest(tmp_path / "prior").env_id == "0" * 64
+
+
+class Own(nn.Tanh):
+    """A layer that no file knows."""
 
 
 class TestSavingRefuses:
     @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-    @pytest.mark.parametrize("name", ["weight", "log_std", "mean", "var"])
+    @pytest.mark.parametrize("name", ["weight", "scale", "mean", "var"])
     def test_what_is_not_finite(self, tmp_path: Path, name: str, value: float) -> None:
         actor, normalizer = trained()
-        parameters = dict(actor.named_parameters())
-        targets = {
-            "weight": next(parameter for key, parameter in parameters.items() if key.endswith("2.weight")),
-            "log_std": next(parameter for key, parameter in parameters.items() if "scale" in key),
-            "mean": normalizer.mean,
-            "var": normalizer.var,
+        parameters = {
+            key: parameter for key, parameter in actor.named_parameters() if key.endswith(("2.weight", "scale"))
         }
+        targets = {key.rpartition("_")[2].rpartition(".")[2]: parameter for key, parameter in parameters.items()}
+        targets |= {"mean": normalizer.mean, "var": normalizer.var}
         targets[name].data.view(-1)[-1] = value
-        with pytest.raises(ValueError, match=r"can't be saved: .* not finite"):
-            save_policy(tmp_path / "policy", actor, normalizer, env_id="Hopper-v5")
+        with pytest.raises(ValueError, match=rf"can't be saved to .*prior: prior\.network\.\S*{name} is not finite"):
+            save_prior(tmp_path / "prior", policy_prior(actor, normalizer), env_id="Hopper-v5")
         assert not list(tmp_path.iterdir())
 
-    def test_statistics_of_another_shape(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match=r"normalizer\.mean must be"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), RunningNorm(OBS + 1), env_id="Hopper-v5")
-
-    def test_statistics_that_are_no_running_norm(self, tmp_path: Path) -> None:
-        with pytest.raises(TypeError, match="RunningNorm, got BatchNorm1d"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), nn.BatchNorm1d(OBS), env_id="Hopper-v5")
-
-    def test_another_precision(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match=r"must be torch\.float32"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS).double(), None, env_id="Hopper-v5")
-
-    @pytest.mark.parametrize("env_id", ["", None, 3])
-    def test_a_missing_environment(self, tmp_path: Path, env_id: Any) -> None:
-        with pytest.raises(ValueError, match="name its environment"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), None, env_id=env_id)
-
-    @pytest.mark.parametrize("told", [{"seed": -1}, {"seed": 1.5}, {"frames": True}, {"frames": "1M"}])
-    def test_impossible_numbers(self, tmp_path: Path, told: dict[str, Any]) -> None:
-        with pytest.raises(ValueError, match="must be an integer"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), None, env_id="Hopper-v5", **told)
-
-    @pytest.mark.parametrize("value", [math.nan, math.inf, object(), torch.zeros(()), {1, 2}])
-    @pytest.mark.parametrize("entry", ["evaluation", "training"])
-    def test_what_json_cannot_hold(self, tmp_path: Path, entry: str, value: Any) -> None:
-        told: dict[str, Any] = {entry: {"nested": [value]}}
-        with pytest.raises(ValueError, match=r"can't be saved.*JSON"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), None, env_id="Hopper-v5", **told)
-        assert not list(tmp_path.iterdir())
-
-    def test_a_manifest_too_long_to_be_read(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match="longer than"):
-            save_policy(
-                tmp_path / "policy", make_actor(OBS, ACTIONS), None, env_id="Hopper-v5", training={"log": "x" * 2**20}
-            )
-
-    def test_networks_that_a_file_cannot_describe(self, tmp_path: Path) -> None:
-        own = TensorDictModule(nn.Linear(OBS, ACTIONS), in_keys=["observation"], out_keys=["logits"])
-        inner = make_actor(OBS, ACTIONS).module[0]
-        normalised = TensorDictModule(nn.BatchNorm1d(OBS), in_keys=["observation"], out_keys=["observation_norm"])
-        for actor in (
-            ProbabilisticActor(own, in_keys=["logits"], distribution_class=MaskedOneHotCategorical),
-            ProbabilisticActor(inner, in_keys=["loc", "scale"], distribution_class=TanhNormal),
-            ProbabilisticActor(
-                inner,
-                in_keys=["loc", "scale"],
-                distribution_class=IndependentNormal,
-                distribution_kwargs={"tanh_loc": True},
+    @pytest.mark.parametrize(
+        ("told", "match"),
+        [
+            *(({"env_id": value}, "name its environment, got env_id=") for value in ("", None, 3)),
+            *(({"seed": value}, "its seed must be null or an integer") for value in (-1, 1.5)),
+            *(({"frames": value}, "its frames must be null or an integer") for value in (True, "1M")),
+            *(
+                ({entry: {"nested": [value]}}, "JSON")
+                for entry in ("evaluation", "training")
+                for value in (math.nan, math.inf, object(), torch.zeros(()), {1, 2})
             ),
-            nn.ModuleList([normalised, make_actor(OBS, ACTIONS)]),
-        ):
-            with pytest.raises(TypeError, match="Only actors of torchrl_priors"):
-                save_policy(tmp_path / "policy", actor, None, env_id="Hopper-v5")
+            ({"training": {"log": "x" * 2**20}}, "longer than"),
+        ],
+    )
+    def test_what_a_manifest_cannot_hold(self, tmp_path: Path, told: dict[str, Any], match: str) -> None:
+        with pytest.raises(ValueError, match=f"can't be saved to .*{match}"):
+            save_prior(tmp_path / "prior", UniformPrior(2), **{"env_id": "Hopper-v5", **told})
+        assert not list(tmp_path.iterdir())
+
+    @pytest.mark.parametrize(
+        ("prior", "match"),
+        [
+            (lambda: CallablePrior(lambda x: x, std=1.0), "can't hold this CallablePrior"),
+            (lambda: ModulePrior(Own(), "logits"), "can't hold Own"),
+            (lambda: AffordancePrior(lambda x: x), "can't hold code"),
+            (lambda: ModulePrior(nn.Sequential(net(), Own()), "logits"), "can't hold Own"),
+            (lambda: ModulePrior(nn.Sequential(nn.ELU(0.5), net()), "logits"), "default options"),
+            (lambda: MixturePrior([UniformPrior(2), CallablePrior(lambda x: 0, num_actions=2)]), "CallablePrior"),
+            (lambda: ModulePrior(net(), "logits").adversary(), "can't hold this NegatedPrior"),
+            (lambda: policy_prior(make_actor(OBS, ACTIONS).double(), None), "in float32"),
+            (lambda: net(), "got Sequential"),
+            (lambda: ActionPrior(make_actor(OBS, ACTIONS)), "this ActionPrior.*policy_prior makes"),
+        ],
+    )
+    def test_code_and_other_precisions(self, prior: Any, match: str, tmp_path: Path) -> None:
+        with pytest.raises(TypeError, match=match):
+            save_prior(tmp_path / "prior", prior(), env_id="Toy-v0")
+        assert not list(tmp_path.iterdir())
 
     def test_a_folder_that_is_missing(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError, match="No folder"):
-            save_policy(tmp_path / "no" / "policy", make_actor(OBS, ACTIONS), None, env_id="Hopper-v5")
+        with pytest.raises(FileNotFoundError, match=r"No folder .*no to write prior in"):
+            save_prior(tmp_path / "no" / "prior", UniformPrior(2), env_id="Hopper-v5")
 
 
 class TestAtomicWrite:
@@ -225,7 +236,7 @@ class TestAtomicWrite:
 
         monkeypatch.setattr(os, function, fail)
         with pytest.raises(OSError, match="no space left"):
-            save_policy(saved.path, *trained(), env_id="Walker2d-v5")
+            save_prior(saved.path, UniformPrior(2), env_id="Walker2d-v5")
         assert saved.path.read_bytes() == before
         assert list(saved.path.parent.iterdir()) == [saved.path]
 
@@ -239,7 +250,7 @@ class TestAtomicWrite:
 
         before = saved.path.read_bytes()
         monkeypatch.setattr(os, "replace", look)
-        save_policy(saved.path, *trained(), env_id="Walker2d-v5")
+        save_prior(saved.path, UniformPrior(2), env_id="Walker2d-v5")
         assert seen == [(saved.path.parent, saved.path.read_bytes(), before)]
         assert read_manifest(saved.path).env_id == "Walker2d-v5"
 
@@ -259,12 +270,5 @@ class TestWithoutSafetensors:
         monkeypatch.setitem(sys.modules, "safetensors", None)
         monkeypatch.setitem(sys.modules, "safetensors.torch", None)
         with pytest.raises(ImportError, match=r"torchrl-priors\[artifacts\]"):
-            save_policy(tmp_path / "policy", make_actor(OBS, ACTIONS), None, env_id="Hopper-v5")
+            save_prior(tmp_path / "prior", UniformPrior(2), env_id="Hopper-v5")
         assert not list(tmp_path.iterdir())
-
-
-def test_manifests_are_values() -> None:
-    manifest = PolicyManifest(env_id="Hopper-v5", obs_dim=11, act_dim=3, hidden=(64, 64), activation="tanh")
-    assert manifest == replace(manifest)
-    with pytest.raises(AttributeError):
-        manifest.seed = 1  # type: ignore[misc]

@@ -12,14 +12,17 @@ from typing import Any
 import pytest
 import safetensors.torch
 import torch
-from artifacts_cases import ACTIONS, OBS, SCALE, Saved, contents, refused, save
+from artifacts_cases import ACTIONS, NETWORK, OBS, SCALE, STORABLE, Saved, contents, gaussian, refused, save
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from torch import nn
 
-from torchrl_priors.artifacts import ArtifactError, load_policy, load_prior, read_manifest, save_policy
-from torchrl_priors.artifacts.format import _NO_DIGEST, _seal, pack
-from torchrl_priors.collectors.running_norm import RunningNorm
+from torchrl_priors import load_prior, policy_prior, save_prior
+from torchrl_priors.artifacts import ArtifactError, read_manifest
+from torchrl_priors.artifacts.format import _NO_DIGEST, KIND, _seal, pack
+from torchrl_priors.collectors import RunningNorm
 from torchrl_priors.networks import make_actor
+from torchrl_priors.priors.layers import GaussianHead, StateIndependentStd, TeacherInput
 
 
 @pytest.fixture
@@ -32,12 +35,13 @@ class TestDamage:
 
     @staticmethod
     def tiny(path: Path) -> bytes:
-        save_policy(path, make_actor(2, 1, hidden=(2,)), RunningNorm(2), env_id="Hopper-v5", evaluation={"mean": 1.0})
+        prior = policy_prior(make_actor(2, 1, hidden=(2,)), RunningNorm(2))
+        save_prior(path, prior, env_id="Hopper-v5", evaluation={"mean": 1.0})
         return path.read_bytes()
 
     def test_every_flipped_byte_is_refused(self, tmp_path: Path) -> None:
         data = self.tiny(tmp_path / "policy")
-        assert len(data) < 2000
+        assert len(data) < 2500
         for position in range(len(data)):
             for mask in (0x01, 0x20):  # another number or letter, and the other case
                 damaged = bytearray(data)
@@ -87,8 +91,8 @@ class TestDamage:
 class TestForeignFiles:
     def test_a_missing_file(self, tmp_path: Path) -> None:
         for path in (tmp_path / "no", tmp_path):
-            for reader in (load_policy, load_prior, read_manifest):
-                with pytest.raises(FileNotFoundError, match="No policy file at"):
+            for reader in (load_prior, read_manifest):
+                with pytest.raises(FileNotFoundError, match="No file of a prior at"):
                     reader(path)
 
     @pytest.mark.parametrize("data", [b"", b"policy", b"\x80\x04", b"PK\x03\x04" + b"\0" * 100, b"{}" * 50])
@@ -97,7 +101,7 @@ class TestForeignFiles:
         refused(tmp_path / "policy", "not a safetensors file")
 
     @pytest.mark.parametrize(
-        ("metadata", "match"), [(None, "with metadata"), ({"format": "pt"}, "not one of torchrl_priors.save_policy")]
+        ("metadata", "match"), [(None, "with metadata"), ({"format": "pt"}, "not one of torchrl_priors.save_prior")]
     )
     def test_safetensors_of_another_program(self, tmp_path: Path, metadata: Any, match: str) -> None:
         safetensors.torch.save_file({"weight": torch.zeros(3)}, tmp_path / "policy", metadata=metadata)
@@ -112,42 +116,29 @@ class TestForeignFiles:
 
     @pytest.mark.parametrize("about", ["1", "[]", "null", '"text"', "{", "[" * 100_000, '{"version": NaN}'])
     def test_a_manifest_of_another_kind(self, tmp_path: Path, about: str) -> None:
-        safetensors.torch.save_file({"w": torch.zeros(1)}, tmp_path / "policy", {"torchrl_priors.policy": about})
+        safetensors.torch.save_file({"w": torch.zeros(1)}, tmp_path / "policy", {KIND: about})
         refused(tmp_path / "policy", "manifest is not")
 
-    @pytest.mark.parametrize("version", [2, 0, "1", None, True, 1.0])
-    def test_an_unknown_version(self, saved: Saved, version: Any) -> None:
+    @pytest.mark.parametrize("version", [0, 1, 3, "1", None, True, 2.0])
+    def test_another_version(self, saved: Saved, version: Any) -> None:
         saved.path.write_bytes(pack(*contents(saved.path), version=version))
-        refused(saved.path, "version")
+        what = "write it again by save_prior" if str(version) == "1" != version else "newer torchrl_priors"
+        refused(saved.path, f"of version {version!r}, .*{what}")
+
+    def test_the_former_format_of_policies(self, saved: Saved) -> None:
+        safetensors.torch.save_file({"w": torch.zeros(1)}, saved.path, {"torchrl_priors.policy": "{}"})
+        refused(saved.path, "it is a policy of an older torchrl_priors, .*: write it again by save_prior")
 
     @pytest.mark.parametrize(
         ("entry", "value", "match"),
         [
-            ("architecture", "transformer", "architecture is unknown: 'transformer'"),
-            ("architecture", None, "architecture is unknown"),
-            ("activation", "sin", "activation is unknown: 'sin'"),
-            ("activation", ["tanh"], "activation is unknown"),
-            ("env_id", "", "name its environment"),
-            ("env_id", 1, "name its environment"),
-            ("obs_dim", 0, "obs_dim must be a positive integer"),
-            ("obs_dim", 4.0, "obs_dim must be a positive integer"),
-            ("act_dim", True, "act_dim must be a positive integer"),
-            ("hidden", 8, "positive sizes"),
-            ("hidden", [8, -8], "positive sizes"),
-            ("hidden", [8, "8"], "positive sizes"),
-            ("normalizer", True, "positive eps and clip"),
-            ("normalizer", {}, "positive eps and clip"),
-            ("normalizer", {"eps": 1e-8, "clip": -1}, "positive eps and clip"),
-            ("normalizer", {"eps": "0", "clip": 10}, "positive eps and clip"),
-            ("seed", "0", "seed must be an integer"),
-            ("evaluation", [], "evaluation must be an object"),
-            ("training", None, "training must be an object"),
-            # well formed, but not what the tensors are
-            ("obs_dim", 5, "must be torch.float32 of shape"),
-            ("act_dim", 2**60, "must be torch.float32 of shape"),
-            ("hidden", [8], "missing or unexpected: actor"),
-            ("hidden", [2**60, 2**60], "must be torch.float32 of shape"),
-            ("normalizer", None, "missing or unexpected: normalizer"),
+            ("env_id", "", "name its environment, got env_id=''"),
+            ("env_id", 1, "name its environment, got env_id=1"),
+            ("seed", "0", "its seed must be null or an integer of at least 0, got '0'"),
+            ("frames", 1.5, "its frames must be null or an integer of at least 0, got 1.5"),
+            ("evaluation", [], "its evaluation must be an object of JSON, got"),
+            ("training", None, "its training must be an object of JSON, got None"),
+            ("prior", [], "its prior must be an object of JSON, got"),
         ],
     )
     def test_an_impossible_manifest(self, saved: Saved, entry: str, value: Any, match: str) -> None:
@@ -157,32 +148,9 @@ class TestForeignFiles:
 
     def test_a_manifest_with_other_entries(self, saved: Saved) -> None:
         tensors, manifest = contents(saved.path)
-        for other in ({**manifest, "code": "print()"}, {k: v for k, v in manifest.items() if k != "hidden"}, None):
-            saved.path.write_bytes(pack(tensors, other))  # type: ignore[arg-type]
-            refused(saved.path, "must have the entries")
-
-    @pytest.mark.parametrize(
-        ("changes", "match"),
-        [
-            ({SCALE: None}, f"missing or unexpected: {SCALE}"),
-            ({"actor.mean.9.weight": torch.zeros(2)}, "missing or unexpected: actor.mean.9.weight"),
-            ({SCALE: torch.zeros(ACTIONS + 1)}, r"must be torch.float32 of shape \(3,\)"),
-            ({SCALE: torch.zeros(ACTIONS, dtype=torch.float64)}, "got torch.float64"),
-            ({SCALE: torch.zeros(ACTIONS, dtype=torch.bfloat16)}, "got torch.bfloat16"),
-            ({SCALE: torch.zeros(0)}, "shape"),
-            ({SCALE: torch.full((ACTIONS,), math.nan)}, "not finite"),
-            ({"actor.mean.0.bias": torch.full((8,), -math.inf)}, "not finite"),
-            ({"normalizer.mean": torch.full((OBS,), math.nan).double()}, "not finite"),
-            ({"normalizer.mean": torch.zeros(OBS)}, "must be torch.float64"),
-            ({"normalizer.var": -torch.ones(OBS).double()}, "negative variance"),
-            ({"normalizer.count": torch.tensor(-1.0).double()}, "negative variance or count"),
-        ],
-    )
-    def test_impossible_tensors(self, saved: Saved, changes: dict[str, Any], match: str) -> None:
-        tensors, manifest = contents(saved.path)
-        tensors = {name: value for name, value in (tensors | changes).items() if value is not None}
-        saved.path.write_bytes(pack(tensors, manifest))
-        refused(saved.path, match)
+        for other in ({**manifest, "code": "print()"}, {k: v for k, v in manifest.items() if k != "seed"}, None):
+            saved.path.write_bytes(pack(tensors, other))
+            refused(saved.path, "must have the entries env_id, evaluation, ")
 
     @pytest.mark.parametrize("dtype", ["F4", "F8_E8M0", "C64", "BOOL", "U16", "object", ""])
     @pytest.mark.parametrize("shape", [[ACTIONS], [-ACTIONS], [0], [2**62, 2], ["3"]])
@@ -191,32 +159,118 @@ class TestForeignFiles:
         data = saved.path.read_bytes()
         size = int.from_bytes(data[:8], "little")
         header = json.loads(data[8 : 8 + size])
-        about = json.loads(header["__metadata__"]["torchrl_priors.policy"])
-        header["__metadata__"]["torchrl_priors.policy"] = json.dumps({**about, "sha256": _NO_DIGEST})
+        about = json.loads(header["__metadata__"][KIND])
+        header["__metadata__"][KIND] = json.dumps({**about, "sha256": _NO_DIGEST})
         header[SCALE] = {"dtype": dtype, "shape": shape, "data_offsets": offsets}
         forged = json.dumps(header).encode()
         saved.path.write_bytes(_seal(struct.pack("<Q", len(forged)) + forged + data[8 + size :]))
-        refused(saved.path, "its tensors can't be read|actor")
+        refused(saved.path, f"its tensors can't be read|{SCALE}")
 
 
-class TestNothingIsUnpickled:
-    class Bomb:
-        def __reduce__(self) -> Any:
-            return Path.touch, (Path("unpickled"),)
+def forge(path: Path, prior: Any, change: Any) -> None:
+    """The file of a prior with other parts and tensors, whose digest is right."""
+    save_prior(path, prior(), env_id="Toy-v0")
+    tensors, manifest = contents(path)
+    change(manifest["prior"], tensors)
+    path.write_bytes(pack(tensors, manifest))
 
-    def test_pickled_files_are_refused_unread(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
-        (tmp_path / "plain.pkl").write_bytes(pickle.dumps(self.Bomb()))
-        torch.save(self.Bomb(), tmp_path / "torch.pt")
-        for name in ("plain.pkl", "torch.pt"):
-            refused(tmp_path / name, "not a safetensors file")
-        assert not (tmp_path / "unpickled").exists()
 
-    def test_reading_uses_no_pickle(self, saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
-        def fail(*args: Any, **kwargs: Any) -> None:
-            raise AssertionError("pickle was used")
+def put(name: str, value: Any, dtype: torch.dtype = torch.float32) -> Any:
+    return lambda parts, tensors: tensors.update({name: torch.as_tensor(value, dtype=dtype)})
 
-        for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
-            monkeypatch.setattr(module, name, fail)
-        load_policy(saved.path)
-        load_prior(saved.path)
+
+def tell(**entries: Any) -> Any:
+    return lambda parts, tensors: parts.update(entries)
+
+
+def layer(number: int, **options: Any) -> Any:
+    return lambda parts, tensors: parts["network"]["layers"][number].update(options)
+
+
+def policy() -> Any:
+    return policy_prior(make_actor(OBS, ACTIONS, hidden=(8, 8)), RunningNorm(OBS))
+
+
+def own_std() -> Any:
+    return gaussian(nn.Linear(OBS, 2), StateIndependentStd(torch.zeros(2)))
+
+
+def linear() -> Any:
+    return gaussian(TeacherInput((OBS,), statistics=(torch.zeros(OBS),) * 2), GaussianHead(OBS, 2))
+
+
+SQUASHED, TABLE, UNIFORM = (STORABLE[name] for name in ("squashed", "table", "uniform"))
+FORGED = [
+    (policy, tell(prior="pickle"), "its kind of prior is unknown: 'pickle'"),
+    (policy, tell(prior="x" * 900_000), r"its kind of prior is unknown: 'xxx.*\.\.\..*xxx'"),
+    (policy, tell(distribution="Delta"), "its distribution is unknown: 'Delta', expected one of categorical"),
+    (policy, tell(output="action"), "Unknown output 'action'"),
+    (policy, tell(output="mean"), r"missing: prior\.std"),
+    (policy, tell(box=1), "its box must be true or false, got 1"),
+    (policy, tell(in_keys=[3]), r"its in_keys must be lists of names, got \[3\]"),
+    (policy, tell(extra=1), "a prior 'module' has the entries network, .*, got .*extra"),
+    (policy, tell(network={"layer": "os.system"}), "its layer is unknown: 'os.system'"),
+    (policy, tell(network=["tanh"]), r"a layer must be an object of JSON, got \['tanh'\]"),
+    (policy, tell(network={"layer": "linear", "size": 3}), "a layer 'linear' has the options in_features, .*got size"),
+    (policy, layer(1, activation="sin"), "activation of a layer 'gaussian_mlp' must be one of elu, .*, got 'sin'"),
+    (policy, layer(1, obs_dim=0), "obs_dim of a layer 'gaussian_mlp' must be a positive integer, got 0"),
+    (policy, layer(1, hidden=[1] * 101), "hidden of a layer 'gaussian_mlp' must be a list of at most 100 sizes"),
+    (policy, layer(1, hidden=[8, -8]), r"hidden of a layer .* must be a positive integer, got \[8, -8\]"),
+    (policy, layer(0, clip=-1), "clip of a layer 'running_norm' must be a positive number, got -1"),
+    (policy, layer(0, eps=10**400), "eps of a layer 'running_norm' must be a positive number, got 1000"),
+    # well formed, but not what the tensors are
+    (
+        policy,
+        layer(1, obs_dim=5),
+        r"prior\.network\.1.mean.0.weight must be torch.float32 of shape \(8, 5\), got .*8, 4",
+    ),
+    (policy, layer(1, hidden=[8]), rf"missing or unexpected: {NETWORK}1\.mean\.4\.bias"),
+    (policy, layer(1, hidden=[2**30, 2**30]), "must be torch.float32 of shape"),
+    # tensors that are not those of the description
+    (policy, lambda _, tensors: tensors.pop(SCALE), f"missing or unexpected: {SCALE}"),
+    (policy, put("a\x1b[2J", [0.0]), r"unexpected: a\\x1b\[2J\."),
+    (policy, put(f"{NETWORK}a\x1b[2J", [0.0]), r"unexpected: prior\.network\.a\\x1b\[2J\."),
+    (policy, put(SCALE, torch.zeros(ACTIONS + 1)), rf"{SCALE} must be torch.float32 of shape \(3,\)"),
+    (policy, put(SCALE, torch.zeros(ACTIONS), torch.float64), "got torch.float64"),
+    (policy, put(SCALE, [math.nan] * ACTIONS), f"{SCALE} is not finite"),
+    (UNIFORM, put("prior.logits", torch.zeros(0, 2**40)), r"is empty: it is of shape \(0, "),
+    (UNIFORM, put("prior.logits", torch.zeros(1, 4)), r"one dimension, got shape \(1, 4\)"),
+    (TABLE, put("prior.q.table", torch.zeros(2**40, 0)), r"is empty: it is of shape \(1099"),
+    # numbers that make what is none
+    (policy, put(SCALE, [0.0, 0.0, 1000.0]), "exponentials of state_independent_scale, overflow or vanish"),
+    (policy, put(f"{NETWORK}0.var", [-1.0] * OBS, torch.float64), "negative variance"),
+    (policy, put(f"{NETWORK}0.count", -1.0, torch.float64), "negative count"),
+    (policy, put(f"{NETWORK}0.mean", [1e300] * OBS, torch.float64), "statistics of its observations overflow"),
+    (own_std, put(f"{NETWORK}1.log_std", [0.0, 1000.0]), "exponentials of log_std, overflow or vanish"),
+    (linear, put(f"{NETWORK}0.var", [-1.0] * OBS, torch.float64), "negative variance"),
+    *(
+        (linear, layer(1, log_std_range=list(values)), "log_std_range of a layer 'gaussian_head' must be a lower and")
+        for values in (("nan", "inf"), (2, -20), (-20, 1000), (-1000, -999), (True, True), (1,))
+    ),
+    (linear, layer(0, statistics=[[OBS]]), "statistics of a layer 'teacher_input' must be null, or the shapes of a"),
+    (SQUASHED, put("prior.low", [-math.inf] * ACTIONS), r"bounds of its actions, prior\.low and high, must be finite"),
+    (SQUASHED, put("prior.low", [3.0] * ACTIONS), "the lower ones below the upper ones"),
+    (TABLE, tell(temperature=1e-300), "its temperature must be a positive number, got 1e-300"),
+    (TABLE, tell(temperature="1"), "its temperature must be a positive number, got '1'"),
+    (TABLE, tell(temperature=1e-40), "overflow at temperature 1e-40"),
+    (TABLE, tell(q={"in_keys": []}), r"its in_keys must be lists of names, got \[\]"),
+    (STORABLE["affordances"], tell(epsilon=True), "its epsilon must be a number, got True"),
+    (STORABLE["mixture"], tell(priors={}), "a mixture must have a list of priors, got"),
+]
+
+
+@pytest.mark.parametrize(("prior", "change", "match"), FORGED)
+def test_what_does_not_fit_or_gives_no_numbers_or_fills_the_memory_or_the_screen_is_refused(
+    tmp_path: Path, prior: Any, change: Any, match: str
+) -> None:
+    forge(tmp_path / "prior", prior, change)
+    refused(tmp_path / "prior", match)
+
+
+def test_reading_uses_no_pickle(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("pickle was used")
+
+    for module, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
+        monkeypatch.setattr(module, name, fail)
+    load_prior(saved.path)

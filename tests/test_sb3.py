@@ -173,7 +173,7 @@ class TestConversion:
             load_prior(out, observation_spec=3, action_spec=3)
         with pytest.raises(ArtifactError, match=r"can't read observations of shape \(4,\)"):
             load_prior(out, observation_spec=4, action_spec=2)
-        with pytest.raises(ArtifactError, match="policy of Noise-v0"):
+        with pytest.raises(ArtifactError, match="prior of Noise-v0"):
             load_prior(out, env_id="Hopper-v5")
 
     @pytest.mark.usefixtures("without_torchrls_groups")

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 
 from recipes.gridworld.study import TaughtWorld, make_learner, run_world
 from recipes.show_weight.show import mean_over, show
+from torchrl_priors import load_prior
 
 ROOT = Path(__file__).parents[1]
 SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20"]
@@ -87,16 +88,12 @@ def mujoco_run(tmp_path_factory) -> Path:
 
 def test_an_episode_is_weighed_by_the_networks_of_the_checkpoint(mujoco_run, tmp_path):
     from recipes.show_weight.episode import load_agent, play, weigh
-    from torchrl_priors.artifacts import load_policy
 
     agent, env_id = load_agent(mujoco_run, None)
-    exported, norm, _ = load_policy(mujoco_run / "policy.safetensors")
-    observation = torch.randn(5, 11)
-    ours, theirs = (
-        actor.get_dist(TensorDict({"observation_norm": normalizer(observation)}, [5])).mean
-        for actor, normalizer in ((agent.actor, agent.normalizer), (exported, norm))
-    )
-    torch.testing.assert_close(ours, theirs)
+    exported = load_prior(mujoco_run / "policy.safetensors")
+    raw = TensorDict(observation=torch.randn(5, 11), batch_size=[5])
+    normal = TensorDict(observation_norm=agent.normalizer(raw["observation"]), batch_size=[5])
+    torch.testing.assert_close(agent.actor.get_dist(normal).mean, exported.get_dist(raw).mean)
     episode = play(agent, env_id, seed=3, steps=30)
     seen = weigh(agent, episode)
     assert seen["degraded"].tolist() == (episode["observation"][:, 1] > 0).tolist()

@@ -85,7 +85,7 @@ class TestModulePrior:
         ):
             torch.testing.assert_close(prior.log_prob(batch.set("action", taken)), expected)
 
-    @pytest.mark.parametrize("shape", [(), (6,), (2, 3), (1, 2, 3)])
+    @pytest.mark.parametrize("shape", [(), (6,), (2, 3), (1, 2, 3), (2, 0)])
     def test_a_network_written_for_one_batch_dimension_advises_on_any(self, shape: tuple[int, ...]) -> None:
         class Images(nn.Sequential):
             def forward(self, x: torch.Tensor) -> torch.Tensor:

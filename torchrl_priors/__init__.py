@@ -32,6 +32,7 @@ from torchrl_priors.priors import (
     MixturePrior,
     ModulePrior,
     UniformPrior,
+    policy_prior,
 )
 from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
 from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
@@ -77,6 +78,7 @@ __all__ = [
     "mean_confidence_interval",
     "multi_teacher_transforms",
     "performance_profile",
+    "policy_prior",
     "probability_of_improvement",
     "register_configs",
     "sample_worlds",

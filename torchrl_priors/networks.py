@@ -30,7 +30,7 @@ class GaussianMLP(nn.Module):
 
     :math:`\mu_\theta(s)` and :math:`\sigma = \exp(\theta_\sigma)`, as in Centa & Preux, "Soft Action Priors: Towards
     Robust Policy Transfer". Its layout follows from the four numbers and names below, which is what an artefact
-    (:func:`~torchrl_priors.artifacts.save_policy`) keeps of it beside the parameters.
+    (:func:`~torchrl_priors.artifacts.save_prior`) keeps of it beside the parameters.
 
     Args:
         obs_dim (int): features of an observation.

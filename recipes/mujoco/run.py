@@ -24,7 +24,7 @@ from recipes.common.run_folder import RunFolder, digest, read_json, sha256
 from recipes.common.schedules import without_idle
 from recipes.common.sweeps import fail, in_sweep
 from recipes.mujoco.config import MujocoConfig, teachers
-from torchrl_priors.artifacts import save_policy
+from torchrl_priors import policy_prior, save_prior
 from torchrl_priors.collectors.evaluation import Evaluation
 from torchrl_priors.teacher_trial import TrialResult
 
@@ -191,10 +191,9 @@ class Run:
     def finish(self, actor: Any, normalizer: Any, env_id: str, arm: str | None = None) -> None:
         """Export the policy as a teacher, and say that the run is done."""
         last = self.evaluations[-1]
-        save_policy(
+        save_prior(
             self.folder.path / "policy.safetensors",
-            actor,
-            normalizer,
+            policy_prior(actor, normalizer),
             env_id=env_id,
             seed=self.cfg.seed,
             frames=self.frames,

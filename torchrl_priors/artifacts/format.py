@@ -1,4 +1,4 @@
-"""The format of a policy file: safetensors whose metadata holds a version, a manifest and the digest of the file."""
+"""The format of a prior's file: safetensors whose metadata holds a version, a manifest and the digest of the file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import re
-import reprlib
 import secrets
 from pathlib import Path
 from types import ModuleType
@@ -14,55 +13,28 @@ from typing import Any
 
 from torch import Tensor
 
-from torchrl_priors.artifacts.errors import ArtifactError
-from torchrl_priors.artifacts.manifest import (
-    PolicyManifest,
-    PriorManifest,
-    check_tensors,
-    parse_manifest,
-    parse_prior_manifest,
-)
+from torchrl_priors.artifacts.errors import ArtifactError, short
 
-__all__ = [
-    "POLICY",
-    "PRIOR",
-    "pack",
-    "read",
-    "read_file",
-    "read_manifest",
-    "write_atomically",
-]
+__all__ = ["KIND", "pack", "read", "write_atomically"]
 
-POLICY, PRIOR = "torchrl_priors.policy", "torchrl_priors.prior"
-_VERSION = 1
-_MAX_HEADER = 1 << 20  # bytes: a policy's header has a few thousand, another model's may have many
+KIND = "torchrl_priors.prior"
+_VERSION = 2
+_FORMER_KIND = "torchrl_priors.policy"  # what only save_policy wrote, which is gone
+_MAX_HEADER = 1 << 20  # bytes: a prior's header has a few thousand, another model's may have many
 _MAX_FILE = 1 << 30  # bytes: a file's bytes are hashed in memory, so what it claims to need has an end
 _NO_DIGEST = "0" * 64
-
-
-def read_manifest(path: str | os.PathLike[str]) -> PolicyManifest | PriorManifest:
-    """Reads what the file of a policy or a prior says of it, and checks the file as :func:`load_policy` does.
-
-    Args:
-        path (str or path): the file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ArtifactError: as :func:`load_policy`.
-        ImportError: safetensors is not installed.
-    """
-    return read_file(Path(path))[1]
+_AGAIN = "of an older torchrl_priors, whose files this release does not read: write it again by save_prior"
 
 
 def _safetensors() -> ModuleType:
     try:
         import safetensors.torch
     except ImportError as error:
-        raise ImportError("Policy files need safetensors: pip install 'torchrl-priors[artifacts]'.") from error
+        raise ImportError("Files of priors need safetensors: pip install 'torchrl-priors[artifacts]'.") from error
     return safetensors
 
 
-def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _VERSION, *, kind: str = POLICY) -> bytes:
+def pack(tensors: dict[str, Tensor], manifest: Any, *, version: Any = _VERSION) -> bytes:
     """The bytes of a file.
 
     Raises:
@@ -70,11 +42,11 @@ def pack(tensors: dict[str, Tensor], manifest: dict[str, Any], version: int = _V
     """
     # the digest comes first, so that no zeros of the manifest are taken for its place
     about = json.dumps({"sha256": _NO_DIGEST, "version": version, "manifest": manifest}, allow_nan=False)
-    data = _seal(_safetensors().torch.save(tensors, metadata={kind: about}))
+    data = _seal(_safetensors().torch.save(tensors, metadata={KIND: about}))
     if int.from_bytes(data[:8], "little") > _MAX_HEADER:
-        raise ValueError(f"This policy can't be saved: its manifest is longer than {_MAX_HEADER} bytes.")
+        raise ValueError(f"its manifest is longer than {_MAX_HEADER} bytes")
     if len(data) > _MAX_FILE:
-        raise ValueError(f"This policy can't be saved: it has {len(data)} bytes, and a file at most {_MAX_FILE}.")
+        raise ValueError(f"it has {len(data)} bytes, and a file at most {_MAX_FILE}")
     return data
 
 
@@ -90,7 +62,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         FileNotFoundError: its folder does not exist.
     """
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"No folder {path.parent} to save a policy in.")
+        raise FileNotFoundError(f"No folder {path.parent} to write {path.name} in.")
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
         with partial.open("xb") as file:
@@ -102,40 +74,27 @@ def write_atomically(path: Path, data: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read(path: Path) -> tuple[dict[str, Tensor], PolicyManifest]:
-    """The tensors and the manifest of a policy's file, after every check."""
-    tensors, manifest = read_file(path)
-    if not isinstance(manifest, PolicyManifest):
-        raise ArtifactError(f"{path} can't be used as a policy: it is a prior of save_prior, which load_prior reads.")
-    return tensors, manifest
+def read(path: Path) -> tuple[dict[str, Tensor], Any]:
+    """The tensors and the manifest of a file whose version and digest are right. What they say is not checked.
 
-
-def read_file(path: Path) -> tuple[dict[str, Tensor], PolicyManifest | PriorManifest]:
-    """The tensors and the manifest of a file, after every check but of a prior's tensors, which building it does."""
+    Raises:
+        FileNotFoundError: there is no such file.
+        ArtifactError: it is damaged or foreign.
+    """
     _safetensors()
     if not path.is_file():
-        raise FileNotFoundError(f"No policy file at {path}.")
-    try:
-        data, kind, about = _read_bytes(path)
-        version = about.get("version")
-        if type(version) is not int or version != _VERSION:
-            raise ArtifactError(
-                f"it is of version {reprlib.repr(version)}, and this release reads version {_VERSION}: it may need a"
-                " newer torchrl_priors"
-            )
-        digest = about.get("sha256")
-        if not isinstance(digest, str) or not re.fullmatch(r"[0-9a-f]{64}", digest):
-            raise ArtifactError("it is damaged: it has no digest")
-        if _seal(data.replace(digest.encode(), _NO_DIGEST.encode(), 1)) != data:
-            raise ArtifactError("it is damaged: its content does not match its digest")
-        if kind == PRIOR:
-            return _load(data), parse_prior_manifest(about.get("manifest"))
-        manifest = parse_manifest(about.get("manifest"))
-        tensors = _load(data)
-        check_tensors(tensors, manifest)
-    except ArtifactError as error:
-        raise ArtifactError(f"{path} can't be used as a policy: {error}.") from error
-    return tensors, manifest
+        raise FileNotFoundError(f"No file of a prior at {path}.")
+    data, about = _read_bytes(path)
+    version, digest = about.get("version"), about.get("sha256")
+    if type(version) is not int or version != _VERSION:
+        older = type(version) is int and 0 < version < _VERSION
+        known = _AGAIN if older else f"and this release reads version {_VERSION}: it may need a newer torchrl_priors"
+        raise ArtifactError(f"it is of version {short(version)}, {known}")
+    if not isinstance(digest, str) or not re.fullmatch(r"[0-9a-f]{64}", digest):
+        raise ArtifactError("it is damaged: it has no digest")
+    if _seal(data.replace(digest.encode(), _NO_DIGEST.encode(), 1)) != data:
+        raise ArtifactError("it is damaged: its content does not match its digest")
+    return _load(data), about.get("manifest")
 
 
 def _load(data: bytes) -> dict[str, Tensor]:
@@ -150,32 +109,34 @@ def _load(data: bytes) -> dict[str, Tensor]:
     return tensors
 
 
-def _read_bytes(path: Path) -> tuple[bytes, str, dict[str, Any]]:
-    """A file of this format, its kind and its metadata; another's tensors, which may be gigabytes, are not read."""
+def _read_bytes(path: Path) -> tuple[bytes, dict[str, Any]]:
+    """A file of this format, and its metadata; another's tensors, which may be gigabytes, are not read."""
     with path.open("rb") as file:
         size = int.from_bytes(file.read(8), "little")
         if size > _MAX_HEADER:
-            raise ArtifactError("it is not a safetensors file with one policy")
+            raise ArtifactError("it is not a safetensors file with one prior")
         header = file.read(size)
         try:
             if len(header) < size:
                 raise ValueError
             metadata = json.loads(header.decode(), object_pairs_hook=_refuse_duplicates)["__metadata__"]
+            former = _FORMER_KIND in metadata
         except (ValueError, TypeError, KeyError, RecursionError):  # JSON and UTF-8 errors are ValueErrors
             raise ArtifactError("it is truncated, or not a safetensors file with metadata") from None
+        if former:
+            raise ArtifactError(f"it is a policy {_AGAIN}")
         try:
-            kind = next(kind for kind in (POLICY, PRIOR) if kind in metadata)
-            about = json.loads(metadata[kind], parse_constant=_refuse_constant, object_pairs_hook=_refuse_duplicates)
-        except (TypeError, StopIteration):
-            raise ArtifactError("it is a safetensors file, but not one of torchrl_priors.save_policy") from None
+            about = json.loads(metadata[KIND], parse_constant=_refuse_constant, object_pairs_hook=_refuse_duplicates)
+        except (TypeError, KeyError):
+            raise ArtifactError("it is a safetensors file, but not one of torchrl_priors.save_prior") from None
         except (ValueError, RecursionError):
             raise ArtifactError("it is damaged: its manifest is not JSON") from None
         if not isinstance(about, dict):
             raise ArtifactError("it is damaged: its manifest is not an object")
         if (size := os.fstat(file.fileno()).st_size) > _MAX_FILE:
-            raise ArtifactError(f"it has {size} bytes, and a policy at most {_MAX_FILE}")
+            raise ArtifactError(f"it has {size} bytes, and a prior at most {_MAX_FILE}")
         file.seek(0)
-        return file.read(size), kind, about
+        return file.read(size), about
 
 
 def _refuse_constant(name: str) -> None:

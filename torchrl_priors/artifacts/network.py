@@ -2,66 +2,75 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
 import torch
+from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_priors.artifacts.errors import ArtifactError
-from torchrl_priors.artifacts.manifest import Sizes, check_against
-from torchrl_priors.networks import ACTIVATIONS
+from torchrl_priors.artifacts.errors import ArtifactError, differing, short
+from torchrl_priors.collectors.running_norm import RunningNorm
+from torchrl_priors.networks import ACTIVATIONS, GaussianMLP
 from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
 
 __all__ = ["build_network", "check_values", "describe_network"]
 
 Parts = dict[str, Any]
+_MAX_SIZES = 100  # of one layer: a description must not make more layers than its tensors could fill
 
 
 def describe_network(network: nn.Module) -> Parts:
-    """What kind of layers a network has, and their sizes.
+    """What kind of layers a network has, and their options: numbers as they are, a tensor by its shape.
 
     Raises:
         TypeError: it has a layer that is not known; its code has no place in a file.
 
     Examples:
-        >>> describe_network(nn.Sequential(nn.Linear(3, 4), nn.Tanh()))
-        {'layer': 'sequential', 'layers': [{'layer': 'linear', 'sizes': [3, 4], 'bias': True}, {'layer': 'tanh'}]}
+        >>> describe_network(nn.Sequential(nn.Linear(3, 4), nn.Tanh()))["layers"]
+        [{'layer': 'linear', 'in_features': 3, 'out_features': 4, 'bias': [4]}, {'layer': 'tanh'}]
     """
     kind = type(network)
     if kind in (nn.Sequential, MLP):
         return {"layer": "sequential", "layers": [describe_network(layer) for layer in network.children()]}
-    for name, (known, describe, _) in _LAYERS.items():
+    for name, (known, options) in _LAYERS.items():
         if kind is known:
-            parts = {"layer": name, **describe(network)}
+            parts = {"layer": name, **{option: _to_json(getattr(network, option)) for option in options}}
             twin = _skeleton(parts)
-            if sizes(twin) == sizes(network) and _options(twin) == _options(network):
+            if _sizes(twin) == _sizes(network) and _shown(twin) == _shown(network):
                 return parts
     raise TypeError(
-        f"A file can hold networks of {', '.join(sorted(known.__name__ for known, *_ in _LAYERS.values()))} in a"
-        f" Sequential, with the default options of PyTorch, and no code of others: it can't hold {network}."
+        f"A file can hold networks of {', '.join(sorted(known.__name__ for known, _ in _LAYERS.values()))} in a"
+        f" Sequential, in float32 and with the default options of PyTorch, and no code of others: it can't hold"
+        f" {network}."
     )
 
 
-def sizes(network: nn.Module) -> Sizes:
-    """Names, shapes and types of what a network's ``state_dict`` holds."""
-    return {name: (tuple(value.shape), value.dtype) for name, value in network.state_dict().items()}
-
-
-def _options(network: nn.Module) -> str:
-    """The options of a layer as PyTorch shows them, without how it uses memory."""
-    return repr(network).replace("inplace=True", "")
-
-
-def build_network(parts: Any, tensors: dict[str, Tensor]) -> nn.Module:
+def build_network(parts: Any, tensors: dict[str, Tensor], prefix: str = "") -> nn.Module:
     """A network from its description and all of its tensors. No random number is drawn.
+
+    Args:
+        parts: its description.
+        tensors (dict): its ``state_dict``.
+        prefix (str): what a message puts before the name of a tensor.
 
     Raises:
         ArtifactError: they do not fit each other, a tensor is not finite, or see :func:`check_values`.
     """
     network = _skeleton(parts)
-    check_against(tensors, sizes(network))
+    expected = _sizes(network)
+    if tensors.keys() != expected.keys():
+        names = differing(prefix + name for name in tensors.keys() ^ expected.keys())
+        raise ArtifactError(f"its tensors are not those of its manifest; missing or unexpected: {names}")
+    for name, (shape, dtype) in expected.items():
+        value = tensors[name]
+        if tuple(value.shape) != shape or value.dtype is not dtype:
+            found = f"{value.dtype} of {tuple(value.shape)}"
+            raise ArtifactError(f"{prefix}{name} must be {dtype} of shape {shape}, got {found}")
+        if not value.isfinite().all():
+            raise ArtifactError(f"{prefix}{name} is not finite: it has NaN or infinite entries")
     network.load_state_dict(tensors, assign=True)
     check_values(network)
     return network
@@ -71,13 +80,21 @@ def check_values(network: nn.Module) -> None:
     """Refuses finite numbers that make what is not finite.
 
     Raises:
-        ArtifactError: a variance of observations is negative, or a standard deviation overflows or vanishes.
+        ArtifactError: statistics of observations have a negative variance or count, or overflow; or a standard
+            deviation overflows or vanishes.
     """
     for layer in network.modules():
-        if isinstance(layer, TeacherInput) and layer.var is not None and (layer.var < 0).any():
+        if isinstance(layer, (TeacherInput, RunningNorm)) and layer.var is not None and (layer.var < 0).any():
             raise ArtifactError("the statistics of its observations have a negative variance")
-        if isinstance(layer, StateIndependentStd) and not _make_std(layer.log_std):
-            raise ArtifactError("its standard deviations, the exponentials of log_std, overflow or vanish")
+        if isinstance(layer, RunningNorm):
+            if layer.count < 0:
+                raise ArtifactError("the statistics of its observations have a negative count")
+            if not all(value.isfinite().all() for value in layer.affine()):
+                raise ArtifactError("the statistics of its observations overflow")
+        if isinstance(layer, (StateIndependentStd, AddStateIndependentNormalScale)):
+            for name, value in layer.named_parameters():
+                if not _make_std(value):
+                    raise ArtifactError(f"its standard deviations, the exponentials of {name}, overflow or vanish")
 
 
 def _make_std(log_std: Tensor) -> bool:
@@ -85,130 +102,139 @@ def _make_std(log_std: Tensor) -> bool:
     return bool((std.isfinite() & (std > 0)).all())
 
 
+def _sizes(network: nn.Module) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+    """Names, shapes and types of what a network's ``state_dict`` holds."""
+    return {name: (tuple(value.shape), value.dtype) for name, value in network.state_dict().items()}
+
+
+def _shown(network: nn.Module) -> str:
+    """A layer and its options as PyTorch shows them, without how it uses memory."""
+    return repr(network).replace("inplace=True", "")
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return list(value.shape)
+    return [_to_json(item) for item in value] if isinstance(value, tuple) else value
+
+
 def _skeleton(parts: Any) -> nn.Module:
     """The network without memory for its parameters."""
+    before = torch.get_default_dtype()
     try:
-        # float32, whatever the default of the process
-        before = torch.get_default_dtype()
-        torch.set_default_dtype(torch.float32)
-        try:
-            with torch.device("meta"):
-                return _layer(parts)
-        finally:
-            torch.set_default_dtype(before)
+        torch.set_default_dtype(torch.float32)  # whatever the default of the process
+        with torch.device("meta"):
+            return _layer(parts)
     except ArtifactError:
         raise
-    except (ArithmeticError, KeyError, LookupError, RecursionError, RuntimeError, TypeError, ValueError) as error:
+    except (ArithmeticError, LookupError, RecursionError, RuntimeError, TypeError, ValueError) as error:
         raise ArtifactError(f"its network can't be built: {type(error).__name__}: {error}") from None
+    finally:
+        torch.set_default_dtype(before)
 
 
 def _layer(parts: Any) -> nn.Module:
     if not isinstance(parts, dict):
-        raise ArtifactError(f"a layer must be an object of JSON, got {parts!r}")
-    options = dict(parts)
-    name = options.pop("layer", None)
-    if name == "sequential" and options.keys() == {"layers"} and isinstance(options["layers"], list):
-        return nn.Sequential(*map(_layer, options["layers"]))
+        raise ArtifactError(f"a layer must be an object of JSON, got {short(parts)}")
+    name, given = parts.get("layer"), {option: value for option, value in parts.items() if option != "layer"}
+    if name == "sequential" and given.keys() == {"layers"} and isinstance(given["layers"], list):
+        return nn.Sequential(*map(_layer, given["layers"]))
     if not isinstance(name, str) or name not in _LAYERS:
-        raise ArtifactError(f"its layer is unknown: {name!r}")
-    return _LAYERS[name][2](**options)
+        raise ArtifactError(f"its layer is unknown: {short(name)}")
+    kind, options = _LAYERS[name]
+    if given.keys() != options.keys():
+        raise ArtifactError(f"a layer {name!r} has the options {', '.join(options)}, got {', '.join(given)}")
+    values = {}
+    for option, read in options.items():
+        try:
+            values[option] = read(given[option])
+        except _Expected as error:
+            raise ArtifactError(f"{option} of a layer {name!r} must be {error}, got {short(given[option])}") from None
+    return kind(**values)
 
 
-def _counts(values: Any, number: int | None = None) -> list[int]:
-    if (
-        not isinstance(values, list)
-        or (number is not None and len(values) != number)
-        or not all(type(value) is int and 1 <= value < 1 << 31 for value in values)
-    ):
-        raise ArtifactError(f"sizes of a layer must be positive integers, got {values!r}")
-    return values
+class _Expected(Exception):
+    """What an option should have been."""
+
+
+def _count(value: Any) -> int:
+    if type(value) is not int or not 1 <= value < 1 << 31:
+        raise _Expected("a positive integer")
+    return value
+
+
+def _counts(value: Any) -> list[int]:
+    if not isinstance(value, list) or len(value) > _MAX_SIZES:
+        raise _Expected(f"a list of at most {_MAX_SIZES} sizes")
+    return [_count(size) for size in value]
 
 
 def _positive(value: Any) -> float:
-    if type(value) not in (int, float) or not 0 < value < float("inf"):
-        raise ArtifactError(f"an option of a layer must be a positive number, got {value!r}")
-    return float(value)
+    if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
+        raise _Expected("a positive number")
+    return value
 
 
 def _flag(value: Any) -> bool:
     if type(value) is not bool:
-        raise ArtifactError(f"an option of a layer must be true or false, got {value!r}")
+        raise _Expected("true or false")
     return value
 
 
-def _make_input(*, shape: Any, normalize: Any, eps: Any, clip: Any, pixels: Any, flatten: Any) -> TeacherInput:
-    shape = _counts(shape)
-    return TeacherInput(
-        shape,
-        statistics=(torch.zeros(shape), torch.zeros(shape)) if _flag(normalize) else None,
-        eps=_positive(eps),
-        clip=_positive(clip),
-        pixels=_flag(pixels),
-        flatten=_flag(flatten),
-    )
+def _activation(value: Any) -> str:
+    if not isinstance(value, str) or value not in ACTIVATIONS:
+        raise _Expected(f"one of {', '.join(sorted(ACTIVATIONS))}")
+    return value
 
 
-def _make_linear(*, sizes: Any, bias: Any) -> nn.Linear:
-    inputs, outputs = _counts(sizes, 2)
-    return nn.Linear(inputs, outputs, bias=_flag(bias))
+def _tensor(value: Any) -> Tensor:
+    return torch.zeros(_counts(value))
 
 
-def _make_head(*, sizes: Any, log_std_range: Any) -> GaussianHead:
+def _has_tensor(value: Any) -> bool:
+    return value is not None and _tensor(value).ndim > 0
+
+
+def _statistics(value: Any) -> tuple[Tensor, Tensor] | None:
+    if value is not None and (not isinstance(value, list) or len(value) != 2):
+        raise _Expected("null, or the shapes of a mean and a variance")
+    return None if value is None else (_tensor(value[0]), _tensor(value[1]))
+
+
+def _log_std_range(value: Any) -> tuple[float, float]:
     if (
-        not isinstance(log_std_range, list)
-        or len(log_std_range) != 2
-        or not all(type(bound) in (int, float) for bound in log_std_range)
-        or not log_std_range[0] <= log_std_range[1]
-        or not _make_std(torch.tensor(log_std_range, dtype=torch.float32, device="cpu"))
+        not isinstance(value, list)
+        or len(value) != 2
+        or not all(type(bound) in (int, float) for bound in value)
+        or not value[0] <= value[1]
+        or not _make_std(torch.tensor(value, dtype=torch.float32, device="cpu"))
     ):
-        raise ArtifactError(
-            "log_std_range must be a lower and an upper bound of the logarithm of a standard deviation, got"
-            f" {log_std_range!r}"
-        )
-    low, high = map(float, log_std_range)
-    return GaussianHead(*_counts(sizes, 2), log_std_range=(low, high))
+        raise _Expected("a lower and an upper bound of the logarithm of a standard deviation")
+    return value[0], value[1]
 
 
-_LAYERS: dict[str, tuple[type[nn.Module], Callable[[Any], Parts], Callable[..., nn.Module]]] = {
-    "linear": (
-        nn.Linear,
-        lambda layer: {"sizes": [layer.in_features, layer.out_features], "bias": layer.bias is not None},
-        _make_linear,
+_LAYERS: dict[str, tuple[type[nn.Module], dict[str, Callable[[Any], Any]]]] = {
+    "gaussian_head": (GaussianHead, {"features": _count, "act_dim": _count, "log_std_range": _log_std_range}),
+    "gaussian_mlp": (
+        GaussianMLP,
+        {"obs_dim": _count, "act_dim": _count, "hidden": _counts, "activation": _activation},
     ),
+    "linear": (nn.Linear, {"in_features": _count, "out_features": _count, "bias": _has_tensor}),
+    "nature_cnn": (NatureCNN, {"shape": _counts, "features": _count}),
+    "running_norm": (RunningNorm, {"shape": _counts, "eps": _positive, "clip": _positive}),
+    "scale_to_box": (ScaleToBox, {"low": _tensor, "high": _tensor}),
+    "state_independent_std": (StateIndependentStd, {"log_std": _tensor}),
     "teacher_input": (
         TeacherInput,
-        lambda layer: {
-            "shape": list(layer.shape),
-            "normalize": layer.mean is not None,
-            "eps": layer.eps,
-            "clip": layer.clip,
-            "pixels": layer.pixels,
-            "flatten": layer.flatten,
+        {
+            "shape": _counts,
+            "statistics": _statistics,
+            "eps": _positive,
+            "clip": _positive,
+            "pixels": _flag,
+            "flatten": _flag,
         },
-        _make_input,
     ),
-    "nature_cnn": (
-        NatureCNN,
-        lambda layer: {"shape": list(layer.shape), "features": layer.features},
-        lambda *, shape, features: NatureCNN(_counts(shape, 3), *_counts([features])),
-    ),
-    "state_independent_std": (
-        StateIndependentStd,
-        lambda layer: {"size": len(layer.log_std)},
-        lambda *, size: StateIndependentStd(torch.zeros(_counts([size]))),
-    ),
-    "gaussian_head": (
-        GaussianHead,
-        lambda layer: {
-            "sizes": [layer.mean.in_features, layer.mean.out_features],
-            "log_std_range": list(layer.log_std_range),
-        },
-        _make_head,
-    ),
-    "scale_to_box": (
-        ScaleToBox,
-        lambda layer: {"size": len(layer.low)},
-        lambda *, size: ScaleToBox(torch.zeros(_counts([size])), torch.zeros(_counts([size]))),
-    ),
-    **{name: (kind, lambda layer: {}, kind) for name, kind in ACTIVATIONS.items()},
+    **{name: (kind, {}) for name, kind in ACTIVATIONS.items()},
 }
+"""By the name of a layer: its class, and for each of its arguments, which are its attributes too, how JSON is read."""

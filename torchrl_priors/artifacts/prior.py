@@ -1,12 +1,9 @@
-"""Priors as files: every kind whose parts are tensors."""
+"""Priors as JSON and tensors: every kind whose parts are tensors."""
 
 from __future__ import annotations
 
-import json
-import os
-from collections.abc import Callable, Mapping
-from dataclasses import asdict
-from pathlib import Path
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,23 +12,18 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, OneHot
 from torchrl.modules import OneHotCategorical
 
-from torchrl_priors.artifacts.errors import ArtifactError, differing
-from torchrl_priors.artifacts.format import PRIOR, pack, write_atomically
-from torchrl_priors.artifacts.manifest import PriorManifest
-from torchrl_priors.artifacts.network import build_network
+from torchrl_priors.artifacts.errors import ArtifactError, differing, short
 from torchrl_priors.artifacts.prior_parts import (
-    Tensors,
+    Parts,
+    Scope,
     find_distribution,
     keys_from_json,
     keys_to_json,
     name_distribution,
     put_network,
     put_source,
-    take_bounds,
-    take_options,
+    take_network,
     take_source,
-    take_tensor,
-    take_tensors,
 )
 from torchrl_priors.priors import (
     ActionPrior,
@@ -42,76 +34,22 @@ from torchrl_priors.priors import (
     UniformPrior,
 )
 
-__all__ = ["build_prior", "save_prior"]
+__all__ = ["build_prior", "describe_prior"]
 
 
-def save_prior(
-    path: str | os.PathLike[str],
-    prior: ActionPrior,
-    *,
-    env_id: str,
-    evaluation: Mapping[str, Any] | None = None,
-    training: Mapping[str, Any] | None = None,
-) -> PriorManifest:
-    """Writes a prior to one ``.safetensors`` file, whole or not at all; :func:`load_prior` reads it.
-
-    Tables and networks of known layers go into a file, and so do mixtures of such priors. Code does not: a
-    :class:`CallablePrior`, a function, a network with layers of its own. A policy of
-    :func:`~torchrl_priors.networks.make_actor` is for :func:`save_policy`; what :func:`load_prior` makes of such a file
-    can't be written again, in a mixture neither: keep the file, and mix what it gives.
-
-    Args:
-        path (str or path): the file; its folder exists. A file of that name is replaced.
-        prior (ActionPrior): a :class:`ModulePrior`, :class:`BoltzmannPrior`, :class:`AffordancePrior`,
-            :class:`UniformPrior`, :class:`MixturePrior`, or what :func:`load_sb3_prior` gives.
-
-    Keyword Args:
-        env_id (str): the environment that it advises on, e.g. ``"HalfCheetah-v5"``.
-        evaluation, training (mapping, optional): what JSON can hold: how good it is, where it is from.
-
-    Returns:
-        PriorManifest: what was written beside the tensors.
+def describe_prior(prior: ActionPrior) -> tuple[Parts, dict[str, Tensor]]:
+    """The parts of a prior, for JSON, and its tensors by name.
 
     Raises:
         TypeError: a part of the prior is code that no file can hold.
-        FileNotFoundError: the folder does not exist.
-        ValueError: a value is not finite, or JSON can't hold ``evaluation`` or ``training``.
-        ImportError: safetensors is not installed.
-
-    Examples:
-        >>> import tempfile, pathlib
-        >>> from torchrl_priors.artifacts import load_prior
-        >>> path = pathlib.Path(tempfile.mkdtemp(), "affordances.safetensors")
-        >>> prior = AffordancePrior(torch.tensor([[True, True, False], [False, True, True]]))
-        >>> manifest = save_prior(path, prior, env_id="MyGrid-v0")
-        >>> load_prior(path).out_keys
-        [('prior', 'logits')]
     """
-    if not isinstance(prior, ActionPrior):
-        raise TypeError(f"save_prior writes ActionPriors, got {type(prior).__name__}.")
-    tensors: Tensors = {}
-    parts = _describe(prior, tensors, "prior.")
-    tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    try:
-        values = {
-            "env_id": env_id,
-            "prior": parts,
-            "evaluation": dict(evaluation or {}),
-            "training": dict(training or {}),
-        }
-        values = json.loads(json.dumps(values, allow_nan=False))
-        manifest = PriorManifest(**values)
-        if not isinstance(env_id, str) or not env_id:
-            raise ValueError(f"it must name its environment, got env_id={env_id!r}")
-        build_prior(dict(tensors), manifest.prior)  # what can't be read again is not written
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"This prior can't be saved: {error}") from error
-    write_atomically(Path(path), pack(tensors, asdict(manifest), kind=PRIOR))
-    return manifest
+    tensors: dict[str, Tensor] = {}
+    parts = _describe(prior, Scope(tensors))
+    return parts, {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
 
 
 def build_prior(
-    tensors: Tensors, parts: Any, *, in_key: NestedKey | None = None, namespace: NestedKey = "prior"
+    parts: Any, tensors: dict[str, Tensor], *, in_key: NestedKey | None = None, namespace: NestedKey = "prior"
 ) -> ActionPrior:
     """The prior of a file, from all of its tensors.
 
@@ -120,170 +58,174 @@ def build_prior(
     """
     left = dict(tensors)
     try:
-        prior = _build(parts, left, "prior.", None, namespace)
-        if in_key is not None and prior.in_keys != [in_key]:
-            if len(prior.in_keys) != 1:
-                raise ArtifactError(f"it reads {prior.in_keys}: in_key can't replace them")
-            prior = _build(parts, dict(tensors), "prior.", in_key, namespace)
+        prior = _build(parts, Scope(left), namespace)
     except ArtifactError:
         raise
     except (ArithmeticError, LookupError, RecursionError, RuntimeError, TypeError, ValueError) as error:
         raise ArtifactError(f"its prior can't be built: {type(error).__name__}: {error}") from None
     if left:
         raise ArtifactError(f"its tensors are not those of its manifest; unexpected: {differing(left)}")
-    return prior
+    if in_key is None or prior.in_keys == [in_key]:
+        return prior
+    if len(prior.in_keys) != 1:
+        raise ArtifactError(f"it reads {prior.in_keys}: in_key can't replace them")
+    return build_prior(_read_instead(parts, keys_to_json([in_key])), tensors, namespace=namespace)
 
 
-# Each kind has a pair of functions: from a prior to JSON, putting its tensors under a prefix; and back, taking them.
+def _read_instead(parts: Any, keys: list[list[str]]) -> Any:
+    """The same description with other ``in_keys``, wherever it has any."""
+    if isinstance(parts, list):
+        return [_read_instead(part, keys) for part in parts]
+    if not isinstance(parts, dict):
+        return parts
+    return {name: keys if name == "in_keys" and part else _read_instead(part, keys) for name, part in parts.items()}
 
 
-def _describe(prior: ActionPrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
+# Each kind has a pair of functions: from a prior to JSON, putting its tensors; and from JSON, whose entries are the
+# names of the arguments, to what the class is called with.
+
+
+def _describe(prior: ActionPrior, scope: Scope) -> Parts:
     for name, (kind, describe, _) in _KINDS.items():
         if type(prior) is kind:
-            return {"prior": name, **describe(prior, tensors, prefix)}
+            return {"prior": name, **describe(prior, scope)}
     raise TypeError(
         f"A file can hold priors of {', '.join(kind.__name__ for kind, *_ in _KINDS.values())}, and no code of others:"
-        f" it can't hold this {type(prior).__name__}. (load_prior makes an ActionPrior of a file of save_policy: keep"
-        " that file.)"
+        f" it can't hold this {type(prior).__name__}. (policy_prior makes a ModulePrior of a policy of make_actor.)"
     )
 
 
-def _build(parts: Any, left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey) -> ActionPrior:
-    if not isinstance(parts, dict) or not isinstance(parts.get("prior"), str) or parts["prior"] not in _KINDS:
-        found = parts.get("prior") if isinstance(parts, dict) else parts
-        raise ArtifactError(f"its kind of prior is unknown: {found!r}")
-    options = {name: value for name, value in parts.items() if name != "prior"}
-    return _KINDS[parts["prior"]][2](left, prefix, in_key, namespace, **options)
+def _build(parts: Any, scope: Scope, namespace: NestedKey = "prior") -> ActionPrior:
+    name = parts.get("prior") if isinstance(parts, dict) else parts
+    if not isinstance(name, str) or name not in _KINDS:
+        raise ArtifactError(f"its kind of prior is unknown: {short(name)}")
+    kind, _, read = _KINDS[name]
+    entries = {entry: value for entry, value in parts.items() if entry != "prior"}
+    if entries.keys() != set(_ENTRIES[name]):
+        raise ArtifactError(f"a prior {name!r} has the entries {', '.join(_ENTRIES[name])}, got {', '.join(entries)}")
+    return kind(**read(scope, **entries), namespace=namespace)
 
 
-def _describe_module(prior: ModulePrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
+def _describe_module(prior: ModulePrior, scope: Scope) -> Parts:
     first, last = prior.module
     params, kwargs = first.module, dict(last.distribution_kwargs)
     if params.std is not None:
-        tensors[f"{prefix}std"] = params.std
-    box = kwargs.keys() == {"low", "high"}
-    if kwargs and not box:
+        scope.put({"std": params.std})
+    if kwargs and kwargs.keys() != {"low", "high"}:
         raise TypeError(f"A file can hold the distribution_kwargs low and high, got {', '.join(sorted(kwargs))}.")
-    for name in kwargs:
-        tensors[prefix + name] = torch.as_tensor(kwargs[name])
+    scope.put({name: torch.as_tensor(value) for name, value in kwargs.items()})
     return {
-        "network": put_network(params.network, tensors, f"{prefix}network."),
+        "network": put_network(params.network, scope),
         "output": prior.output,
-        "std": params.std is not None,
         "distribution": name_distribution(prior),
-        "box": box,
+        "box": bool(kwargs),
         "in_keys": keys_to_json(prior.in_keys),
     }
 
 
-def _build_module(
-    left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
-) -> ModulePrior:
-    network, output, std, distribution, box, keys = take_options(
-        options, "network", "output", "std", "distribution", "box", "in_keys"
-    )
-    bounds = take_bounds(left, prefix) if box else None
-    return ModulePrior(
-        build_network(network, take_tensors(left, f"{prefix}network.")),
-        output,
-        std=take_tensor(left, f"{prefix}std") if std else None,
-        in_keys=keys_from_json(keys, in_key),
-        distribution_class=find_distribution(distribution),
-        distribution_kwargs=bounds,
-        namespace=namespace,
-    )
+def _read_module(scope: Scope, network: Any, output: Any, distribution: Any, box: Any, in_keys: Any) -> dict[str, Any]:
+    if type(box) is not bool:
+        raise ArtifactError(f"its box must be true or false, got {short(box)}")
+    return {
+        "module": take_network(network, scope),
+        "output": output,
+        "std": scope.take("std") if output == "mean" else None,
+        "in_keys": keys_from_json(in_keys),
+        "distribution_class": find_distribution(distribution),
+        "distribution_kwargs": scope.take_bounds() if box else None,
+    }
 
 
-def _describe_values(prior: BoltzmannPrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
+def _describe_values(prior: BoltzmannPrior, scope: Scope) -> Parts:
     source, softmax, _ = prior.module
     return {
-        "q": put_source(source, tensors, f"{prefix}q."),
+        "q": put_source(source, scope.inside("q")),
         "temperature": float(softmax.module.temperature),
         "distribution": name_distribution(prior),
     }
 
 
-def _build_values(
-    left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
-) -> BoltzmannPrior:
-    q, temperature, distribution = take_options(options, "q", "temperature", "distribution")
-    values, in_keys = take_source(q, left, f"{prefix}q.", in_key)
+def _read_values(scope: Scope, q: Any, temperature: Any, distribution: Any) -> dict[str, Any]:
+    values, in_keys = take_source(q, scope.inside("q"))
     _check_temperature(temperature, values)
-    return BoltzmannPrior(
-        values, temperature, in_keys=in_keys, distribution_class=find_distribution(distribution), namespace=namespace
-    )
+    return {
+        "q": values,
+        "temperature": temperature,
+        "in_keys": in_keys,
+        "distribution_class": find_distribution(distribution),
+    }
 
 
 def _check_temperature(temperature: Any, values: Tensor | nn.Module) -> None:
     """A finite number can still be 0 in float32, or make a finite action value infinite."""
     divisor = torch.tensor(float(temperature)) if type(temperature) in (int, float) else torch.tensor(0.0)
     if not 0 < divisor < torch.inf:
-        raise ArtifactError(f"its temperature must be a positive number, got {temperature!r}")
+        raise ArtifactError(f"its temperature must be a positive number, got {short(temperature)}")
     if isinstance(values, Tensor) and ((values / divisor).isfinite() != values.isfinite()).any():
         raise ArtifactError(f"its action values overflow at temperature {temperature!r}")
 
 
-def _describe_affordances(prior: AffordancePrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
+def _describe_affordances(prior: AffordancePrior, scope: Scope) -> Parts:
     return {
-        "weights": put_source(prior.module[0], tensors, f"{prefix}weights."),
+        "weights": put_source(prior.module[0], scope.inside("weights")),
         "epsilon": prior.epsilon,
         "distribution": name_distribution(prior),
     }
 
 
-def _build_affordances(
-    left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
-) -> AffordancePrior:
-    weights, epsilon, distribution = take_options(options, "weights", "epsilon", "distribution")
-    source, in_keys = take_source(weights, left, f"{prefix}weights.", in_key)
-    return AffordancePrior(
-        source, epsilon, in_keys=in_keys, distribution_class=find_distribution(distribution), namespace=namespace
-    )
-
-
-def _describe_uniform(prior: UniformPrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
-    constant = prior.module[0]
-    for name in constant.out_keys:
-        tensors[prefix + name] = getattr(constant, name)
-    return {"over": "box" if "low" in constant.out_keys else name_distribution(prior)}
-
-
-def _build_uniform(
-    left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
-) -> UniformPrior:
-    (over,) = take_options(options, "over")
-    if over == "box":
-        low = (bounds := take_bounds(left, prefix))["low"]
-        return UniformPrior(Bounded(**bounds, shape=low.shape, dtype=low.dtype), namespace=namespace)
-    logits = take_tensor(left, f"{prefix}logits")
-    if logits.ndim != 1 or not logits.isfinite().all():  # a shape such as [0, 2**33] takes no bytes of the file
-        raise ArtifactError(f"{prefix}logits must be finite and of one dimension, got shape {tuple(logits.shape)}")
-    number = len(logits)
-    return UniformPrior(OneHot(number) if find_distribution(over) is OneHotCategorical else number, namespace=namespace)
-
-
-def _describe_mixture(prior: MixturePrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
+def _read_affordances(scope: Scope, weights: Any, epsilon: Any, distribution: Any) -> dict[str, Any]:
+    source, in_keys = take_source(weights, scope.inside("weights"))
+    if type(epsilon) not in (int, float):
+        raise ArtifactError(f"its epsilon must be a number, got {short(epsilon)}")
     return {
-        "priors": [_describe(part, tensors, f"{prefix}{number}.") for number, part in enumerate(prior.priors)],
-        "weights": put_source(prior.weights, tensors, f"{prefix}weights."),
+        "weights": source,
+        "epsilon": epsilon,
+        "in_keys": in_keys,
+        "distribution_class": find_distribution(distribution),
     }
 
 
-def _build_mixture(
-    left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey, **options: Any
-) -> MixturePrior:
-    priors, weights = take_options(options, "priors", "weights")
+def _describe_uniform(prior: UniformPrior, scope: Scope) -> Parts:
+    constant = prior.module[0]
+    scope.put({name: getattr(constant, name) for name in constant.out_keys})
+    return {"over": "box" if "low" in constant.out_keys else name_distribution(prior)}
+
+
+def _read_uniform(scope: Scope, over: Any) -> dict[str, Any]:
+    if over == "box":
+        bounds = scope.take_bounds()
+        return {"actions": Bounded(**bounds, shape=bounds["low"].shape, dtype=bounds["low"].dtype)}
+    logits = scope.take("logits")
+    if logits.ndim != 1 or not logits.isfinite().all():  # a shape such as [0, 2**33] takes no bytes of the file
+        raise ArtifactError(
+            f"{scope.prefix}logits must be finite and of one dimension, got shape {tuple(logits.shape)}"
+        )
+    return {"actions": OneHot(len(logits)) if find_distribution(over) is OneHotCategorical else len(logits)}
+
+
+def _describe_mixture(prior: MixturePrior, scope: Scope) -> Parts:
+    return {
+        "priors": [_describe(part, scope.inside(number)) for number, part in enumerate(prior.priors)],
+        "weights": put_source(prior.weights, scope.inside("weights")),
+    }
+
+
+def _read_mixture(scope: Scope, priors: Any, weights: Any) -> dict[str, Any]:
     if not isinstance(priors, list):
-        raise ArtifactError(f"a mixture must have a list of priors, got {priors!r}")
-    built = [_build(part, left, f"{prefix}{number}.", in_key, "prior") for number, part in enumerate(priors)]
-    source, in_keys = take_source(weights, left, f"{prefix}weights.", in_key)
-    return MixturePrior(built, source, in_keys=in_keys, namespace=namespace)
+        raise ArtifactError(f"a mixture must have a list of priors, got {short(priors)}")
+    source, in_keys = take_source(weights, scope.inside("weights"))
+    return {
+        "priors": [_build(part, scope.inside(number)) for number, part in enumerate(priors)],
+        "weights": source,
+        "in_keys": in_keys,
+    }
 
 
-_KINDS: dict[str, tuple[type[ActionPrior], Callable[..., dict[str, Any]], Callable[..., ActionPrior]]] = {
-    "module": (ModulePrior, _describe_module, _build_module),
-    "boltzmann": (BoltzmannPrior, _describe_values, _build_values),
-    "affordance": (AffordancePrior, _describe_affordances, _build_affordances),
-    "uniform": (UniformPrior, _describe_uniform, _build_uniform),
-    "mixture": (MixturePrior, _describe_mixture, _build_mixture),
+_KINDS: dict[str, tuple[type[ActionPrior], Callable[..., Parts], Callable[..., dict[str, Any]]]] = {
+    "module": (ModulePrior, _describe_module, _read_module),
+    "boltzmann": (BoltzmannPrior, _describe_values, _read_values),
+    "affordance": (AffordancePrior, _describe_affordances, _read_affordances),
+    "uniform": (UniformPrior, _describe_uniform, _read_uniform),
+    "mixture": (MixturePrior, _describe_mixture, _read_mixture),
 }
+_ENTRIES = {name: list(inspect.signature(read).parameters)[1:] for name, (*_, read) in _KINDS.items()}

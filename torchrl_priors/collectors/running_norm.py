@@ -78,8 +78,7 @@ class RunningNorm(nn.Module):
         """
         if self._frozen:
             raise RuntimeError("The statistics of this RunningNorm are frozen.")
-        if x.shape[x.ndim - len(self.shape) :] != self.shape:
-            raise ValueError(f"Expected data of shape [..., {tuple(self.shape)}], got {tuple(x.shape)}.")
+        self._check_shape(x)
         data = x.to(self.mean).reshape(-1, *self.shape)
         if not data.shape[0]:
             raise ValueError("An update needs at least one datum.")
@@ -106,9 +105,17 @@ class RunningNorm(nn.Module):
 
         Returns:
             Tensor: float32, ``[*B, *shape]``, in ``[-clip, clip]``.
+
+        Raises:
+            ValueError: the trailing dimensions are not ``shape``; they are never broadcast.
         """
+        self._check_shape(x)
         mean, inverse_std = self.affine()
         return ((x.to(torch.float32) - mean) * inverse_std).clamp(-self.clip, self.clip)
+
+    def _check_shape(self, x: Tensor) -> None:
+        if x.shape[x.ndim - len(self.shape) :] != self.shape:
+            raise ValueError(f"Expected data of shape [..., {', '.join(map(str, self.shape))}], got {tuple(x.shape)}.")
 
     def as_module(self, in_key: NestedKey = "observation", out_key: NestedKey = "observation_norm") -> TensorDictModule:
         """This normaliser (not a copy) as a module that reads and writes keys of a tensordict.
@@ -122,4 +129,4 @@ class RunningNorm(nn.Module):
 
     def extra_repr(self) -> str:
         """What ``repr`` shows."""
-        return f"{tuple(self.shape)}, eps={self.eps}, clip={self.clip}, count={int(self.count)}, frozen={self._frozen}"
+        return f"{tuple(self.shape)}, eps={self.eps}, clip={self.clip}"

@@ -6,6 +6,7 @@ from torchrl_priors.priors.boltzmann import BoltzmannPrior
 from torchrl_priors.priors.callable import CallablePrior
 from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
+from torchrl_priors.priors.policy import policy_prior
 from torchrl_priors.priors.uniform import UniformPrior
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "MixturePrior",
     "ModulePrior",
     "UniformPrior",
+    "policy_prior",
 ]

@@ -60,6 +60,11 @@ class TeacherInput(nn.Module):
                 )
             self.register_buffer(name, None if value is None else value.detach().double().clone())
 
+    @property
+    def statistics(self) -> tuple[Tensor, Tensor] | None:
+        """The mean and the variance, unless observations stay raw."""
+        return None if self.mean is None or self.var is None else (self.mean, self.var)
+
     def forward(self, observation: Tensor) -> Tensor:
         """From raw observations ``[*B, *shape]`` to float32 ``[*B, *shape]``, or ``[*B, features]``."""
         batch_ndim = observation.ndim - len(self.shape)
@@ -120,6 +125,7 @@ class GaussianHead(nn.Module):
 
     def __init__(self, features: int, act_dim: int, *, log_std_range: tuple[float, float] = (-20.0, 2.0)) -> None:
         super().__init__()
+        self.features, self.act_dim = features, act_dim
         self.mean = nn.Linear(features, act_dim)
         self.log_std = nn.Linear(features, act_dim)
         self.log_std_range = tuple(log_std_range)

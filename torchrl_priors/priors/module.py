@@ -118,7 +118,7 @@ class _Flat(TensorDictModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.ndim == 1:
             return super().forward(tensordict)
-        flat = super().forward(tensordict.select(*self.in_keys).reshape(-1))
+        flat = super().forward(tensordict.select(*self.in_keys).reshape(tensordict.batch_size.numel()))
         for key in self.out_keys:
             tensordict.set(key, flat.get(key).reshape(*tensordict.batch_size, *flat.get(key).shape[1:]))
         return tensordict
