@@ -21,9 +21,9 @@ from recipes.schedule_config import ScheduleConfig, check_schedule
 from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.networks import make_actor
-from torchrl_priors.objectives import cross_entropy
 
 __all__ = ["ALONE", "MujocoConfig", "check", "method_of", "teachers"]
 
@@ -131,7 +131,6 @@ class MujocoConfig:
     let_go: LetGo = field(default_factory=LetGo)
     cross_entropy: str | None = MISSING
     td_error: str = MISSING
-    centering: str = MISSING
     bonus_coeff: float = MISSING
     aux_coeff: float | None = MISSING
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
@@ -177,7 +176,7 @@ def check(cfg: MujocoConfig) -> None:
         ImportError: names the extra that is needed.
     """
     check_keys(cfg)
-    spec = method_of(cfg)
+    method_of(cfg)  # that there is such a method
     files = teachers(cfg)
     if cfg.method == "trial":
         _check_arms(cfg, files)
@@ -188,7 +187,6 @@ def check(cfg: MujocoConfig) -> None:
         _check_trial(cfg)
     options = {
         "td_error": (cfg.td_error, ("original", "shaped")),
-        "centering": (cfg.centering, ("none", "prior", "policy")),
         "prior.degrade": (cfg.prior.degrade, ("none", "structural", "random")),
         "weight.trained": (cfg.weight.trained, ("minibatch", "rollout", "oracle")),
         "let_go.methods": (cfg.let_go.methods, ("trial", "all", "none")),
@@ -198,8 +196,6 @@ def check(cfg: MujocoConfig) -> None:
     for key, (choice, allowed) in options.items():
         _require(choice in allowed, key, choice, f"one of {', '.join(map(str, allowed))}")
     check_schedule(cfg.schedule)
-    if spec.relative:
-        _require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
     positive = {
         "total_frames": cfg.total_frames,
         "env.num_envs": cfg.env.num_envs,

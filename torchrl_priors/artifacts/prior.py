@@ -34,11 +34,11 @@ from torchrl_priors.artifacts.prior_parts import (
     take_tensors,
 )
 from torchrl_priors.priors import (
-    ActionPrior,
     AffordancePrior,
     BoltzmannPrior,
     MixturePrior,
     ModulePrior,
+    Prior,
     UniformPrior,
 )
 
@@ -47,7 +47,7 @@ __all__ = ["build_prior", "save_prior"]
 
 def save_prior(
     path: str | os.PathLike[str],
-    prior: ActionPrior,
+    prior: Prior,
     *,
     env_id: str,
     evaluation: Mapping[str, Any] | None = None,
@@ -62,7 +62,7 @@ def save_prior(
 
     Args:
         path (str or path): the file; its folder exists. A file of that name is replaced.
-        prior (ActionPrior): a :class:`ModulePrior`, :class:`BoltzmannPrior`, :class:`AffordancePrior`,
+        prior (Prior): a :class:`ModulePrior`, :class:`BoltzmannPrior`, :class:`AffordancePrior`,
             :class:`UniformPrior`, :class:`MixturePrior`, or what :func:`load_sb3_prior` gives.
 
     Keyword Args:
@@ -87,8 +87,8 @@ def save_prior(
         >>> load_prior(path).out_keys
         [('prior', 'logits')]
     """
-    if not isinstance(prior, ActionPrior):
-        raise TypeError(f"save_prior writes ActionPriors, got {type(prior).__name__}.")
+    if not isinstance(prior, Prior):
+        raise TypeError(f"save_prior writes priors, got {type(prior).__name__}.")
     tensors: Tensors = {}
     parts = _describe(prior, tensors, "prior.")
     tensors = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
@@ -112,7 +112,7 @@ def save_prior(
 
 def build_prior(
     tensors: Tensors, parts: Any, *, in_key: NestedKey | None = None, namespace: NestedKey = "prior"
-) -> ActionPrior:
+) -> Prior:
     """The prior of a file, from all of its tensors.
 
     Raises:
@@ -137,7 +137,7 @@ def build_prior(
 # Each kind has a pair of functions: from a prior to JSON, putting its tensors under a prefix; and back, taking them.
 
 
-def _describe(prior: ActionPrior, tensors: Tensors, prefix: str) -> dict[str, Any]:
+def _describe(prior: Prior, tensors: Tensors, prefix: str) -> dict[str, Any]:
     for name, (kind, describe, _) in _KINDS.items():
         if type(prior) is kind:
             return {"prior": name, **describe(prior, tensors, prefix)}
@@ -148,7 +148,7 @@ def _describe(prior: ActionPrior, tensors: Tensors, prefix: str) -> dict[str, An
     )
 
 
-def _build(parts: Any, left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey) -> ActionPrior:
+def _build(parts: Any, left: Tensors, prefix: str, in_key: NestedKey | None, namespace: NestedKey) -> Prior:
     if not isinstance(parts, dict) or not isinstance(parts.get("prior"), str) or parts["prior"] not in _KINDS:
         found = parts.get("prior") if isinstance(parts, dict) else parts
         raise ArtifactError(f"its kind of prior is unknown: {found!r}")
@@ -280,7 +280,7 @@ def _build_mixture(
     return MixturePrior(built, source, in_keys=in_keys, namespace=namespace)
 
 
-_KINDS: dict[str, tuple[type[ActionPrior], Callable[..., dict[str, Any]], Callable[..., ActionPrior]]] = {
+_KINDS: dict[str, tuple[type[Prior], Callable[..., dict[str, Any]], Callable[..., Prior]]] = {
     "module": (ModulePrior, _describe_module, _build_module),
     "boltzmann": (BoltzmannPrior, _describe_values, _build_values),
     "affordance": (AffordancePrior, _describe_affordances, _build_affordances),

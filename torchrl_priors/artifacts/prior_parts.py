@@ -14,8 +14,8 @@ from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 from torchrl_priors.artifacts.errors import ArtifactError
 from torchrl_priors.artifacts.network import build_network, describe_network
 from torchrl_priors.lookup import StateTable
-from torchrl_priors.priors import ActionPrior
-from torchrl_priors.priors.mixture import FixedWeights, distribution_class
+from torchrl_priors.priors import Prior
+from torchrl_priors.priors.mixture import FixedWeights
 
 __all__ = [
     "Tensors",
@@ -110,9 +110,9 @@ def take_bounds(left: Tensors, prefix: str) -> dict[str, Tensor]:
     return {"low": low, "high": high}
 
 
-def name_distribution(prior: ActionPrior) -> str:
+def name_distribution(prior: Prior) -> str:
     """What a file calls the distribution of a prior."""
-    kind = distribution_class(prior)
+    kind = prior.distribution_class
     for name, known in _DISTRIBUTIONS.items():
         if kind is known:
             return name

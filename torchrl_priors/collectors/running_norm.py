@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 __all__ = ["RunningNorm"]
@@ -109,16 +107,6 @@ class RunningNorm(nn.Module):
         """
         mean, inverse_std = self.affine()
         return ((x.to(torch.float32) - mean) * inverse_std).clamp(-self.clip, self.clip)
-
-    def as_module(self, in_key: NestedKey = "observation", out_key: NestedKey = "observation_norm") -> TensorDictModule:
-        """This normaliser (not a copy) as a module that reads and writes keys of a tensordict.
-
-        Examples:
-            >>> from tensordict import TensorDict
-            >>> RunningNorm(3).as_module()(TensorDict({"observation": torch.full((3,), 20.0)}))["observation_norm"]
-            tensor([10., 10., 10.])
-        """
-        return TensorDictModule(self, in_keys=[in_key], out_keys=[out_key])
 
     def extra_repr(self) -> str:
         """What ``repr`` shows."""

@@ -1,4 +1,4 @@
-"""Soft action priors: one interface, :class:`ActionPrior`, and ready-made teachers."""
+"""Soft action priors: one interface, :class:`Prior`, and ready-made teachers."""
 
 from torchrl_priors.priors.action_prior import ActionPrior
 from torchrl_priors.priors.affordance import AffordancePrior
@@ -6,6 +6,7 @@ from torchrl_priors.priors.boltzmann import BoltzmannPrior
 from torchrl_priors.priors.callable import CallablePrior
 from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
+from torchrl_priors.priors.prior import Prior
 from torchrl_priors.priors.uniform import UniformPrior
 
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "CallablePrior",
     "MixturePrior",
     "ModulePrior",
+    "Prior",
     "UniformPrior",
 ]

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch import distributions as d
 from torchrl.modules import IndependentNormal
 
-from torchrl_priors.priors.action_prior import ActionPrior
-from torchrl_priors.priors.smoothing import check_epsilon, smoothed_logits
+from torchrl_priors.priors.action_prior import ActionPrior, policy_of
+from torchrl_priors.priors.spread import as_std, check_epsilon, smoothed_logits
 
 __all__ = ["CallablePrior"]
 
@@ -38,7 +38,7 @@ class CallablePrior(ActionPrior):
         in_keys (sequence of NestedKey, optional): defaults to ``["observation"]``. Several are several arguments.
         distribution_class (type, optional): defaults to :class:`~torchrl.modules.IndependentNormal` or
             :class:`~torch.distributions.Categorical` (indices).
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
         ValueError: neither ``std`` nor ``num_actions``, or both, or out of range; at call, the policy's action has
@@ -78,16 +78,10 @@ class CallablePrior(ActionPrior):
             controller = _Continuous(policy, keys, batched, std)
         else:
             controller = _Discrete(policy, keys, batched, num_actions or 0, check_epsilon(epsilon))
-        default = d.Categorical if std is None else IndependentNormal
+        if distribution_class is None:
+            distribution_class = d.Categorical if std is None else IndependentNormal
         super().__init__(
-            ProbabilisticTensorDictSequential(
-                controller,
-                ProbabilisticTensorDictModule(
-                    in_keys=controller.out_keys,
-                    out_keys=["action"],
-                    distribution_class=default if distribution_class is None else distribution_class,
-                ),
-            ),
+            policy_of(controller, names=controller.out_keys, distribution_class=distribution_class),
             namespace=namespace,
         )
 
@@ -127,9 +121,7 @@ class _Continuous(_Controller):
     ) -> None:
         super().__init__(policy, in_keys, batched)
         self.out_keys = ["loc", "scale"]
-        self.register_buffer("std", torch.as_tensor(std, dtype=torch.get_default_dtype()))
-        if self.std.ndim > 1 or not ((self.std > 0) & self.std.isfinite()).all():
-            raise ValueError(f"std must be positive and finite, a number or one per dimension, got {std}.")
+        self.register_buffer("std", as_std(std))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         loc = self.actions(tensordict).to(self.std)
