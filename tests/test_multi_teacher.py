@@ -16,9 +16,11 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from test_objectives_training import Signs, accuracy, make_actor
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import Bounded
+from torchrl.data import Bounded, LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+from torchrl.trainers.algorithms import PPOTrainer
 
 from torchrl_priors import (
     AE2RLoss,
@@ -30,6 +32,7 @@ from torchrl_priors import (
     ModulePrior,
     MultiTeacherLoss,
     Prior,
+    PriorShaping,
     PriorWeight,
     UniformPrior,
     prior_transforms,
@@ -80,7 +83,9 @@ def train(
     gae.set_keys(reward=loss.tensor_keys.reward)
     optimizer = torch.optim.Adam(loss.parameters(), lr=0.03)
     env.set_seed(0)
-    collector = Collector(env, actor, frames_per_batch=128, total_frames=batches * 128, postproc=prior_transforms(loss))
+    collector = Collector(
+        env, actor, frames_per_batch=128, total_frames=batches * 128, postproc=prior_transforms(loss, num_samples=1)
+    )
     for batch in collector:
         flat = gae(batch).reshape(-1)
         for _ in range(4):
@@ -255,6 +260,56 @@ class TestSeveralTeachers:
         once.set_keys(prior_log_prob=("north", "prior_log_prob"))
         gradient = torch.autograd.grad(once(data)["loss_prior_critic"], critic.module.weight)[0]
         torch.testing.assert_close(critic.module.weight.grad, gradient)
+
+    @pytest.mark.parametrize("functional", [True, False])
+    def test_ppo_around_them_has_their_losses_and_runs_the_student_once(self, functional: bool) -> None:
+        priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
+        weights = [PriorWeight(nn.Linear(3, 1)) for _ in priors]
+        critic, raw_critic = (ValueOperator(nn.Linear(3, 1), in_keys=["observation"]) for _ in range(2))
+        prior_loss = MultiTeacherLoss(actor, priors, weights, raw_critic, functional=functional)
+        loss = ClipPPOPriorLoss(actor, critic, prior_loss)
+        data = GAE(gamma=0.99, lmbda=0.95, value_network=critic)(self.batch(prior_loss)).reshape(-1)
+        calls: list[int] = []
+        actor.module[0].module.register_forward_hook(lambda *_: calls.append(1))
+        losses = loss(data)
+        assert len(calls) == 1
+        assert set(loss.out_keys) <= set(losses.keys())
+        both = {**ClipPPOLoss(actor, critic, functional=functional)(data), **prior_loss(data)}
+        for name, value in both.items():
+            torch.testing.assert_close(losses[name], value)
+        parameters = {p for network in (actor, critic, raw_critic, *weights) for p in network.parameters()}
+        assert {p for p in loss.parameters() if p.requires_grad} == parameters
+        loss.make_value_estimator(gamma=0.5)
+        assert [part.gamma.item() for part in prior_loss.teachers] == [0.5, 0.5]
+
+    @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")  # the trainer is experimental
+    def test_torchrls_trainer_learns_from_both(self) -> None:
+        torch.manual_seed(0)
+        priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
+        weights = [PriorWeight(nn.Linear(3, 1)) for _ in priors]
+        critic, raw_critic = (ValueOperator(nn.Linear(3, 1), in_keys=["observation"]) for _ in range(2))
+        loss = ClipPPOPriorLoss(actor, critic, MultiTeacherLoss(actor, priors, weights, raw_critic, gamma=0.9))
+        env = Signs()
+        env.set_seed(0)
+        trainer = PPOTrainer(
+            collector=Collector(env, actor, frames_per_batch=64, total_frames=128),
+            total_frames=128,
+            frame_skip=1,
+            optim_steps_per_batch=1,
+            num_epochs=2,
+            loss_module=loss,
+            optimizer=torch.optim.Adam(loss.parameters(), lr=0.03),
+            replay_buffer=TensorDictReplayBuffer(
+                storage=LazyTensorStorage(64), sampler=SamplerWithoutReplacement(), batch_size=32
+            ),
+            reward_key=loss.tensor_keys.reward,
+            progress_bar=False,
+            enable_logging=False,
+        )
+        PriorShaping().register(trainer)
+        before = copy.deepcopy([weight.state_dict() for weight in weights])
+        trainer.train()
+        assert not any(same_tensors(old, weight.state_dict()) for old, weight in zip(before, weights, strict=True))
 
     def test_keys_are_renamed_for_all(self) -> None:
         priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 
+from torchrl_priors.keys import read
 from torchrl_priors.lookup import StateTable
 from torchrl_priors.priors.prior import NegatedPrior, Prior, PriorWrapper
 
@@ -119,29 +121,22 @@ class StructuralDegradation(Degradation):
         state_key: NestedKey = "state",
     ) -> None:
         super().__init__(prior, adversary)
-        self._function: Callable[[TensorDictBase], Any]
         if isinstance(degraded, Tensor):
             _check_bool(degraded)
             degraded = StateTable(degraded, in_key=state_key, out_key="degraded")
+        elif not callable(degraded):
+            self._read_too([degraded := unravel_key(degraded)])
+            degraded = partial(read, key=degraded, hint="it says which states are degraded")
+        self.degraded = degraded
         if isinstance(degraded, TensorDictModuleBase):
             self.degraded = deepcopy(degraded).requires_grad_(False).eval()
             self._read_too(degraded.in_keys)
-        elif callable(degraded):
-            self._function = degraded
-        else:
-            self._mask_key = unravel_key(degraded)
-            self._read_too([self._mask_key])
 
     def mask(self, tensordict: TensorDictBase) -> Tensor:
         """Which of the states of ``tensordict`` are degraded: bool, ``[*B]`` or ``[*B, 1]``."""
-        if hasattr(self, "_mask_key"):
-            mask = tensordict.get(self._mask_key, None)
-            if mask is None:
-                raise KeyError(f"The mask of degraded states is missing: no {self._mask_key!r} in the tensordict.")
-        elif hasattr(self, "_function"):
-            mask = self._function(tensordict.copy())
-        else:
-            mask = self.degraded(tensordict.copy()).get(self.degraded.out_keys[0])
+        mask: Any = self.degraded(tensordict.copy())
+        if isinstance(self.degraded, TensorDictModuleBase):
+            mask = mask.get(self.degraded.out_keys[0])
         _check_bool(mask)
         return mask
 
@@ -161,13 +156,11 @@ class RandomDegradation(Degradation):
     Keyword Args:
         seed (int, optional): seeds a generator of the prior's own, whose state is part of the ``state_dict``. The draws
             are the same on every device. Defaults to ``None``: torch's global generator.
-        generator (torch.Generator, optional): a CPU generator to draw from, instead of ``seed``.
         draw_key (NestedKey, optional): where the draw is kept, bool ``[*B, 1]``. Defaults to
             ``(namespace, "degraded")``. Two degradations of one prior need two keys.
 
     Raises:
-        ValueError: ``p`` is not a probability, both a seed and a generator are given, the generator is not a CPU one,
-            or a degradation inside ``prior`` uses the same ``draw_key``.
+        ValueError: ``p`` is not a probability, or a degradation inside ``prior`` uses the same ``draw_key``.
 
     Examples:
         >>> import torch
@@ -189,20 +182,13 @@ class RandomDegradation(Degradation):
         adversary: Prior | None = None,
         *,
         seed: int | None = None,
-        generator: torch.Generator | None = None,
         draw_key: NestedKey | None = None,
     ) -> None:
         if not 0 <= p <= 1:
             raise ValueError(f"p must be a probability in [0, 1], got {p}.")
-        if seed is not None and generator is not None:
-            raise ValueError("Pass a seed or a generator, not both.")
-        if generator is not None and generator.device.type != "cpu":
-            raise ValueError(
-                f"Draws come from a CPU generator, to be the same everywhere; got one on {generator.device}."
-            )
         super().__init__(prior, adversary)
         self.p = float(p)
-        self.generator = torch.Generator().manual_seed(seed) if seed is not None else generator
+        self.generator = None if seed is None else torch.Generator().manual_seed(seed)
         self.draw_key = unravel_key((self.namespace, "degraded") if draw_key is None else draw_key)
         if self.draw_key in super().draw_keys:
             raise ValueError(

@@ -38,7 +38,8 @@ class ActionPrior(Prior):
         namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
-        TypeError: ``module`` gives no distribution (a greedy value-based actor can be a :class:`BoltzmannPrior`).
+        TypeError: ``module`` is a prior, or gives no distribution (a greedy actor over action values can be a
+            :class:`BoltzmannPrior`).
         ValueError: the distribution is a point mass, which has no log-probability to advise with.
         NotImplementedError: the distribution is a composite of several actions.
 
@@ -58,6 +59,8 @@ class ActionPrior(Prior):
     """
 
     def __init__(self, module: TensorDictModuleBase, *, namespace: NestedKey = "prior") -> None:
+        if isinstance(module, Prior):
+            raise TypeError(f"An ActionPrior is made of a policy, and a {type(module).__name__} is a prior already.")
         last = _distribution_module(module)
         names = [key[-1] if isinstance(key, tuple) else key for key in last.dist_keys]
         super().__init__(module.in_keys, names, last.distribution_class, namespace=namespace)
