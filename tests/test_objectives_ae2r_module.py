@@ -255,7 +255,6 @@ def test_methods_without_a_loss_have_none(method):
         ({"method": "a2er"}, "Unknown method"),
         ({"td_error": "raw"}, "td_error"),
         ({"weight_target": "return"}, "weight_target"),
-        ({"loss_critic_type": "l3"}, "loss_critic_type"),
         ({"gamma": 1.5}, "gamma"),
         ({"aux_coeff": "1"}, "aux_coeff"),
         ({"prior_weight": None}, "pass prior_weight"),

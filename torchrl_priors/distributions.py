@@ -149,9 +149,7 @@ def cross_entropy_and_kl(
 def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | None:
     """The exact cross-entropy of the pair, or ``None``."""
     if isinstance(dist, CATEGORICAL) and isinstance(prior_dist, CATEGORICAL):
-        log_probs, prior_log_probs = dist.logits, prior_dist.logits
-        # an action that the student can't take costs nothing, even where the prior forbids it too: 0 log 0 = 0
-        return categorical_cross_entropy(log_probs, prior_log_probs.masked_fill(log_probs.isneginf(), 0.0))
+        return categorical_cross_entropy(dist.logits, prior_dist.logits)
     if isinstance(prior_dist, BoxUniform):
         return -prior_dist.log_density.expand(torch.broadcast_shapes(dist.batch_shape, prior_dist.batch_shape))
     if isinstance(dist, d.Independent) and isinstance(prior_dist, d.Independent):

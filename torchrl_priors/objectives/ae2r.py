@@ -33,9 +33,8 @@ _LOGS = ("prior_kl", "prior_cross_entropy", "prior_td_error", "prior_weight", "p
 class AE2RLoss(NetworksLoss):
     r"""Auxiliary loss and prior-weight loss of (adaptive) entropy regularisation towards a soft action prior.
 
-    Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer". It stands beside the loss of a policy-gradient
-    algorithm (:class:`~torchrl.objectives.ClipPPOLoss`, :class:`~torchrl.objectives.A2CLoss`, ...) and adds, with
-    :math:`\pi` the student, :math:`\pi_0` the prior and :math:`\omega(s)\in[0,1]` the prior weight,
+    Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer". It stands beside any policy-gradient loss and
+    adds, with :math:`\pi` the student, :math:`\pi_0` the prior and :math:`\omega(s)\in[0,1]` the prior weight,
 
     * ``"loss_prior"``, :math:`c_{aux}\,\mathrm{sg}[\omega(s_t)]\,H^X_{s_t}(\pi\|\pi_0)`, which reaches the actor only;
       being a cross-entropy and no divergence, it pulls towards the prior's best action, not to its entropy (that of
@@ -91,7 +90,6 @@ class AE2RLoss(NetworksLoss):
         num_samples (int, optional): samples per state where the cross-entropy has no closed form, see
             :func:`~torchrl_priors.cross_entropy`. Defaults to ``None``.
         reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"``. Defaults to ``"mean"``.
-        loss_critic_type (str): ``"l1"``, ``"l2"`` or ``"smooth_l1"``. Defaults to ``"l2"``.
         prior_in_batch (bool): read the parameters of the prior's distribution from the batch instead of running the
             prior, where ``PriorLogProb(prior, ..., keep_params=True)`` left them: once a rollout, not once a minibatch.
             It needs a :class:`~torchrl_priors.Prior`. Defaults to ``False``.
@@ -124,19 +122,10 @@ class AE2RLoss(NetworksLoss):
         >>> weight = TensorDictModule(weight, in_keys=["observation"], out_keys=["prior_weight"])
         >>> critic = ValueOperator(torch.nn.Linear(3, 1), in_keys=["observation"])
         >>> loss = AE2RLoss(actor(), actor(), weight, critic)
-        >>> data = TensorDict(
-        ...     {
-        ...         "observation": torch.randn(5, 3),
-        ...         "prior_log_prob": -torch.ones(5, 1),
-        ...         "next": {
-        ...             "observation": torch.randn(5, 3),
-        ...             "prior_log_prob": -torch.ones(5, 1),
-        ...             "reward": torch.randn(5, 1),
-        ...             "terminated": torch.zeros(5, 1, dtype=torch.bool),
-        ...         },
-        ...     },
-        ...     [5],
-        ... )
+        >>> observation, advice = torch.randn(5, 3), -torch.ones(5, 1)
+        >>> following = {"reward": torch.randn(5, 1), "terminated": torch.zeros(5, 1, dtype=torch.bool)}
+        >>> following |= {"observation": observation, "prior_log_prob": advice}
+        >>> data = TensorDict({"observation": observation, "next": following}, [5])
         >>> losses = loss(data)
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_prior', 'loss_prior_critic', 'loss_prior_weight']
@@ -200,7 +189,6 @@ class AE2RLoss(NetworksLoss):
         gamma: float = 0.99,
         num_samples: int | None = None,
         reduction: Literal["none", "mean", "sum"] | None = None,
-        loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
         prior_in_batch: bool = False,
         functional: bool = True,
     ):
@@ -208,7 +196,6 @@ class AE2RLoss(NetworksLoss):
         weight_target = spec.weight_target if weight_target is None else weight_target
         check_option("td_error", td_error, ("original", "shaped"))
         check_option("weight_target", weight_target, ("td", "advantage", "none"))
-        check_option("loss_critic_type", loss_critic_type, ("l1", "l2", "smooth_l1"))
         for name, share in (("gamma", gamma), ("kl_share", kl_share)):
             if share is not None and not 0.0 <= share <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {share}.")
@@ -219,7 +206,6 @@ class AE2RLoss(NetworksLoss):
                 f"prior_in_batch=True needs a Prior, got {type(prior).__name__}: ActionPrior(policy) makes it one."
             )
 
-        self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
         super().__init__(functional=functional)
         self.spec = spec
@@ -227,7 +213,6 @@ class AE2RLoss(NetworksLoss):
         self.weight_target = weight_target
         self.num_samples = num_samples
         self.reduction = "mean" if reduction is None else reduction
-        self.loss_critic_type = loss_critic_type
 
         self.set_network("actor_network", actor_network)
         self.prior = prior
@@ -271,19 +256,10 @@ class AE2RLoss(NetworksLoss):
         """The loss of each teacher: this one."""
         return [self]
 
-    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
-        self._in_keys = None
-
     @property
     def in_keys(self) -> list[NestedKey]:
         """What the losses of this instance read from the batch (``prior_bonus`` is read for logging if it is there)."""
-        if self._in_keys is None:
-            self._in_keys = list(dict.fromkeys(key for term in self.terms for key in term.in_keys))
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+        return list(dict.fromkeys(key for term in self.terms for key in term.in_keys))
 
     @property
     def out_keys(self) -> list[NestedKey]:

@@ -39,6 +39,9 @@ class NetworksLoss(LossModule):
             setattr(self, name, network)
             setattr(self, f"{name}_params", None)
 
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        pass  # there is no value estimator
+
     def params_of(self, name: str) -> contextlib.AbstractContextManager:
         """A context in which a network has the parameters of this loss."""
         params = getattr(self, f"{name}_params")

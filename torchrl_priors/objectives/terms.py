@@ -133,7 +133,7 @@ class RawCriticTerm(Term):
             target = td_residual(torch.zeros_like(next_value), reward, next_value, terminated, loss.gamma)
             found["prior_td_error"] = target - value
         if loss.trains_critic:
-            found["loss_prior_critic"] = distance_loss(target, value, loss_function=loss.loss_critic_type)
+            found["loss_prior_critic"] = distance_loss(target, value, loss_function="l2")
 
 
 class WeightTerm(Term):

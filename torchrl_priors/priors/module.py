@@ -53,6 +53,7 @@ class ModulePrior(ActionPrior):
         ValueError: an unknown ``output``; a ``std`` that is missing, not positive, or of no use.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> batch = TensorDict(observation=torch.randn(5, 3), action=torch.zeros(5, 2), batch_size=[5])
         >>> ModulePrior(torch.nn.Linear(3, 2), "mean", std=0.5).log_prob(batch).shape
@@ -142,6 +143,9 @@ class _Params(nn.Module):
             return value.log()
         if self.output == "mean":
             assert self.std is not None
+            if self.std.ndim and self.std.shape != value.shape[-1:]:
+                shapes = f"{tuple(value.shape[1:])} and {tuple(self.std.shape)}"
+                raise ValueError(f"std must be a number or one per dimension of the action, got {shapes}.")
             return value, self.std.to(value.dtype).expand_as(value)
         return value
 
