@@ -9,7 +9,6 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import unravel_key
-from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives import LossModule
 
@@ -101,16 +100,6 @@ class MultiTeacherLoss(LossModule):
     def teachers(self) -> list[AE2RLoss]:
         """The loss of each teacher."""
         return list(self.losses)  # type: ignore[arg-type]
-
-    @property
-    def functional(self) -> bool:
-        """Whether the networks are functionalised."""
-        return self.teachers[0].functional
-
-    @property
-    def gamma(self) -> Tensor:
-        """The discount."""
-        return self.teachers[0].gamma
 
     def set_keys(self, **kwargs: Any) -> None:
         """Renames an entry for all teachers.

@@ -105,9 +105,10 @@ class ClipPPOPriorLoss(ClipPPOLoss):
             _check_same("student", actor_network, loss.actor_network, "actor_network")
             if loss.td_error == "shaped" and loss.critic_network is not None:
                 _check_same("critic", critic_network, loss.critic_network, "critic_network with td_error='shaped'")
-        super().__init__(actor_network, critic_network, functional=prior_loss.functional, **kwargs)
+        functional = prior_loss.teachers[0].functional
+        super().__init__(actor_network, critic_network, functional=functional, **kwargs)
         # one set of parameters, so that a move to another device or dtype keeps them one
-        for loss in prior_loss.teachers if prior_loss.functional else ():
+        for loss in prior_loss.teachers if functional else ():
             loss.actor_network_params = self.actor_network_params
             if loss.td_error == "shaped" and loss.critic_network_params is not None:
                 loss.critic_network_params = self.critic_network_params
@@ -118,7 +119,7 @@ class ClipPPOPriorLoss(ClipPPOLoss):
     @property
     def gamma(self) -> Any:
         """The discount."""
-        return self.prior_loss.gamma
+        return self.prior_loss.teachers[0].gamma
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Any:
         """Make the value estimator as in :class:`~torchrl.objectives.LossModule`; its discount is the prior's too."""
