@@ -11,19 +11,19 @@ import argparse
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, GymWrapper, RewardSum, TransformedEnv
+from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
 from torchrl_priors import (
     METHODS,
     ActionPrior,
+    AE2RLoss,
     ClipPPOPriorLoss,
     CoeffScheduler,
     LinearSchedule,
-    PriorBonus,
-    PriorLogProb,
     PriorWeight,
+    prior_transforms,
 )
 from torchrl_priors.collectors import make_vector_env
 
@@ -60,14 +60,13 @@ def critic():
 
 
 env = TransformedEnv(
-    GymWrapper(make_vector_env("CartPole-v1", num_envs=16), categorical_action_encoding=True), Compose(RewardSum())
+    GymWrapper(make_vector_env("CartPole-v1", num_envs=16), categorical_action_encoding=True), RewardSum()
 )
 env.set_seed(args.seed)
 actor, prior, weight = categorical_actor(mlp(2)), ActionPrior(categorical_actor(under_the_pole)), PriorWeight(mlp(1))
-loss = ClipPPOPriorLoss(
-    actor, critic(), prior, weight, critic(), method=args.method, normalize_advantage=True, bonus_coeff=0.1
-)
-postproc = Compose(PriorLogProb.from_loss(loss), PriorBonus.from_loss(loss))  # of the loss's networks and settings
+loss_prior = AE2RLoss(actor, prior, weight, critic(), method=args.method, bonus_coeff=0.1)
+loss = ClipPPOPriorLoss(actor, critic(), loss_prior, normalize_advantage=True)
+postproc = prior_transforms(loss)  # of the loss's networks and settings
 advantage = GAE(gamma=0.99, lmbda=0.95, value_network=loss.critic_network)
 advantage.set_keys(reward=loss.tensor_keys.reward)
 slow = list(weight.parameters())

@@ -10,11 +10,11 @@ import argparse
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import MultiSyncCollector
-from torchrl.envs import Compose, GymWrapper, RewardSum, TransformedEnv
+from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, ClipPPOPriorLoss, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
 from torchrl_priors.collectors import make_vector_env
 
 
@@ -58,7 +58,8 @@ if __name__ == "__main__":  # workers import this file
     torch.manual_seed(args.seed)
 
     actor, prior, weight = categorical_actor(mlp(2)), ActionPrior(categorical_actor(balance)), PriorWeight(mlp(1))
-    loss = ClipPPOPriorLoss(actor, critic(), prior, weight, critic(), method=args.method, bonus_coeff=0.1)
+    loss_prior = AE2RLoss(actor, prior, weight, critic(), method=args.method, bonus_coeff=0.1)
+    loss = ClipPPOPriorLoss(actor, critic(), loss_prior)
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=loss.critic_network, average_gae=True)
     advantage.set_keys(reward=loss.tensor_keys.reward)
     optim = torch.optim.Adam(loss.parameters(), lr=1e-3)
@@ -67,7 +68,7 @@ if __name__ == "__main__":  # workers import this file
         actor,
         frames_per_batch=2048,
         total_frames=args.frames,
-        postproc=Compose(PriorLogProb.from_loss(loss), PriorBonus.from_loss(loss)),
+        postproc=prior_transforms(loss),
     )
     collector.set_seed(args.seed)
 

@@ -12,11 +12,10 @@ from catch import Catch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import Compose
 from torchrl.modules import MLP, ConvNet, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, ClipPPOPriorLoss, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--method", choices=METHODS, default="ae2r")
@@ -66,17 +65,17 @@ prior = ActionPrior(categorical_actor(follow, COLUMNS), namespace=("agent", "pri
 prior.set_keys(action=("agent", "action"))
 weight = PriorWeight(cnn(1), in_keys=[PIXELS], out_keys=[("agent", "prior_weight")])
 value, raw_value = critic(("agent", "value")), critic(("agent", "raw_value"))
-loss = ClipPPOPriorLoss(actor, value, prior, weight, raw_value, method=args.method, bonus_coeff=0.1)
-names = ("action", "done", "terminated", "value", "raw_value", "advantage", "value_target", "prior_log_prob")
-keys = {name: ("agent", name) for name in (*names, "prior_bonus", "prior_weight")}
-keys |= {"reward": ("agent", "shaped_reward"), "raw_reward": ("agent", "reward")}
-keys |= {"sample_log_prob": ("agent", "log_prob")}
+loss_prior = AE2RLoss(actor, prior, weight, raw_value, method=args.method, bonus_coeff=0.1)
+loss_prior.set_keys(**{name: ("agent", name) for name in ("reward", "terminated", "prior_log_prob", "prior_bonus")})
+loss = ClipPPOPriorLoss(actor, value, loss_prior)
+keys = {name: ("agent", name) for name in ("action", "done", "terminated", "value", "advantage", "value_target")}
+keys |= {"reward": ("agent", "shaped_reward"), "sample_log_prob": ("agent", "log_prob")}
 loss.set_keys(**keys)
 advantage = GAE(gamma=0.99, lmbda=0.95, value_network=loss.critic_network, average_gae=True)
 advantage.set_keys(
     **{name: keys[name] for name in ("reward", "done", "terminated", "value", "advantage", "value_target")}
 )
-postproc = Compose(PriorLogProb.from_loss(loss), PriorBonus.from_loss(loss))
+postproc = prior_transforms(loss)
 optim = torch.optim.Adam(loss.parameters(), lr=1e-3)
 collector = Collector(env, actor, frames_per_batch=1536, total_frames=args.frames, postproc=postproc)
 

@@ -15,7 +15,7 @@ from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.trainers.algorithms import PPOTrainer
 
-from torchrl_priors import METHODS, ActionPrior, ClipPPOPriorLoss, PriorShaping, PriorWeight
+from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorShaping, PriorWeight
 from torchrl_priors.collectors import make_vector_env
 
 parser = argparse.ArgumentParser()
@@ -55,15 +55,9 @@ env = TransformedEnv(
 )
 env.set_seed(args.seed)
 actor = categorical_actor(mlp(2))
-loss = ClipPPOPriorLoss(
-    actor,
-    critic(),
-    ActionPrior(categorical_actor(balance)),
-    PriorWeight(mlp(1)),
-    critic(),
-    method=args.method,
-    bonus_coeff=0.1,
-)
+prior, weight = ActionPrior(categorical_actor(balance)), PriorWeight(mlp(1))
+loss_prior = AE2RLoss(actor, prior, weight, critic(), method=args.method, bonus_coeff=0.1)
+loss = ClipPPOPriorLoss(actor, critic(), loss_prior)
 trainer = PPOTrainer(
     collector=Collector(env, actor, frames_per_batch=2048, total_frames=args.frames),
     total_frames=args.frames,

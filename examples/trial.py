@@ -15,7 +15,7 @@ from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import ActionPrior, ClipPPOPriorLoss, Plateau, PriorLogProb, TeacherTrial
+from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, Plateau, TeacherTrial, prior_transforms
 from torchrl_priors.collectors import make_vector_env
 
 parser = argparse.ArgumentParser()
@@ -61,10 +61,10 @@ class Student:
         actor = categorical_actor(MLP(in_features=4, out_features=2, num_cells=[64, 64]))
         critic = ValueOperator(MLP(in_features=4, out_features=1, num_cells=[64, 64]), in_keys=["observation"])
         method, prior = ("none", bot(torch.zeros(4))) if push is None else (args.method, bot(push))
-        self.loss = ClipPPOPriorLoss(actor, critic, prior, method=method, normalize_advantage=True)
+        self.loss = ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, prior, method=method), normalize_advantage=True)
         self.advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
         self.optim = torch.optim.Adam(self.loss.parameters(), lr=1e-3)
-        postproc = PriorLogProb.from_loss(self.loss)
+        postproc = prior_transforms(self.loss)
         self.batches = iter(Collector(env, actor, frames_per_batch=2048, total_frames=-1, postproc=postproc))
 
     def round(self):

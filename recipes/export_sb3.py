@@ -17,7 +17,6 @@ from torchrl.modules import TanhNormal
 from recipes.common.checks import check_keys, require_file_name
 from recipes.common.sweeps import start
 from torchrl_priors.artifacts import load_sb3_prior, save_prior
-from torchrl_priors.priors.mixture import distribution_class
 
 
 @dataclass
@@ -44,7 +43,7 @@ def export(cfg: ExportConfig) -> None:
     check_keys(cfg)
     require_file_name(cfg.out)
     prior = load_sb3_prior(cfg.model, vecnormalize=cfg.vecnormalize, std=cfg.std, activation=cfg.activation)
-    if distribution_class(prior) is TanhNormal:
+    if prior.distribution_class is TanhNormal:
         raise ValueError(
             f"std=null: {cfg.model} is a SAC policy, whose squashed Gaussian has no finite opinion beyond the bounds of"
             " the actions, and the students of recipes.mujoco are Gaussians: set std, the spread around its action, in"

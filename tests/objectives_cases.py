@@ -9,6 +9,8 @@ from torch import distributions as d
 from torch import nn
 from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
 
+from torchrl_priors.objectives import AE2RLoss, ClipPPOPriorLoss
+
 OBS, ACTIONS = 3, 2
 DISTRIBUTIONS = {
     "categorical": d.Categorical,
@@ -68,7 +70,6 @@ def make_batch(kind="categorical", batch=(6,), observation="observation"):
         {
             observation: torch.randn(*batch, OBS),
             "prior_log_prob": -torch.rand(*batch, 1) - 0.1,
-            "prior_center": torch.rand(*batch, 1),
             "advantage": torch.randn(*batch, 1),
             "value_target": torch.randn(*batch, 1),
             "next": {
@@ -79,7 +80,6 @@ def make_batch(kind="categorical", batch=(6,), observation="observation"):
                 "terminated": terminated,
                 "done": terminated.clone(),
                 "prior_log_prob": log_prob.masked_fill(terminated, 0.0),
-                "prior_center": torch.rand(*batch, 1),
             },
         },
         batch,
@@ -108,3 +108,16 @@ def same_tensors(first, second):
 
 def loss_names(losses):
     return {key for key, _ in losses.items() if key.startswith("loss_")}
+
+
+OF_PRIOR_LOSS = {"method", "td_error", "bonus_coeff", "aux_coeff", "gamma", "num_samples", "prior_in_batch"}
+
+
+def make_ppo_prior(
+    actor, critic, prior, prior_weight=None, prior_critic=None, loss_class=ClipPPOPriorLoss, functional=True, **kwargs
+):
+    """PPO with one teacher; each setting goes to the loss that it is of."""
+    options = {name: kwargs.pop(name) for name in OF_PRIOR_LOSS & kwargs.keys()}
+    prior_critic = critic if options.get("td_error") == "shaped" else prior_critic
+    prior_loss = AE2RLoss(actor, prior, prior_weight, prior_critic, functional=functional, **options)
+    return loss_class(actor, critic, prior_loss, **kwargs)

@@ -6,7 +6,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tensordict import TensorDict
 
 from torchrl_priors.collectors import RunningNorm
 
@@ -90,14 +89,3 @@ def test_a_state_dict_carries_the_statistics_to_the_bit() -> None:
     norm.update(data)
     other.update(data)
     assert torch.equal(norm.var, other.var)
-
-
-@pytest.mark.parametrize(
-    ("in_key", "out_key"), [("observation", "observation_norm"), (("agent", "obs"), ("agent", "deep", "norm"))]
-)
-def test_as_module_shares_the_statistics(in_key: str | tuple, out_key: str | tuple) -> None:
-    norm = RunningNorm(3)
-    module = norm.as_module(in_key, out_key)
-    norm.update(torch.randn(50, 3))
-    data = TensorDict({in_key: torch.randn(2, 3)}, [2])
-    assert torch.equal(module(data)[out_key], norm(data[in_key]))

@@ -203,7 +203,5 @@ class TestRandomDegradation:
         for p in (-0.1, 1.1, float("nan")):
             with pytest.raises(ValueError, match="probability"):
                 RandomDegradation(prior, p)
-        with pytest.raises(ValueError, match="not both"):
-            RandomDegradation(prior, 0.5, seed=0, generator=torch.Generator())
         with pytest.raises(ValueError, match="bool"):
             RandomDegradation(prior, 0.5).draw(visits(2).set(("prior", "degraded"), torch.zeros(2, 1)))

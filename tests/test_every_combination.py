@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, ClipPPOPriorLoss, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorBonus, PriorLogProb, PriorWeight
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 FRAMES = 32
@@ -81,7 +81,7 @@ def train(method: str, discrete: bool, device: str, collect: Any) -> None:
     actor, prior = make_actor(discrete).to(device), ActionPrior(make_actor(discrete)).to(device)
     critic, raw_critic = (ValueOperator(nn.Linear(3, 1), in_keys=["observation"]).to(device) for _ in range(2))
     weight = PriorWeight(nn.Linear(3, 1)).to(device) if METHODS[method].adaptive else None
-    loss = ClipPPOPriorLoss(actor, critic, prior, weight, raw_critic, method=method)
+    loss = ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, prior, weight, raw_critic, method=method))
     gae = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
     gae.set_keys(reward=loss.tensor_keys.reward)
     teacher, before = copy.deepcopy(prior.state_dict()), copy.deepcopy(dict(loss.named_parameters()))

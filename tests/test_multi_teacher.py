@@ -16,23 +16,26 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from test_objectives_training import Signs, accuracy, make_actor
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import Bounded
+from torchrl.data import Bounded, LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
+from torchrl.trainers.algorithms import PPOTrainer
 
 from torchrl_priors import (
-    ActionPrior,
     AE2RLoss,
     AffordancePrior,
     BoltzmannPrior,
     CallablePrior,
+    ClipPPOPriorLoss,
     MixturePrior,
     ModulePrior,
     MultiTeacherLoss,
+    Prior,
+    PriorShaping,
     PriorWeight,
     UniformPrior,
-    multi_teacher_transforms,
+    prior_transforms,
 )
 from torchrl_priors.artifacts import load_sb3_prior
 
@@ -66,26 +69,28 @@ def normal_actor(distribution_class: Any = IndependentNormal, **kwargs: Any) -> 
 
 
 def train(
-    env: Signs, actor: ProbabilisticActor, priors: list[ActionPrior], *, method: str = "ae2r", batches: int = 8
+    env: Signs, actor: ProbabilisticActor, priors: list[Prior], *, method: str = "ae2r", batches: int = 8
 ) -> list[PriorWeight]:
     """PPO with an AE2R loss for each teacher; the weights of the teachers."""
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
     raw_critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
     weights = [PriorWeight(nn.Sequential(nn.Linear(3, 16), nn.Tanh(), nn.Linear(16, 1))) for _ in priors]
-    transforms = multi_teacher_transforms(priors, weights, actor, method=method, keep_params=True)
-    loss = ClipPPOLoss(actor, critic)
     loss_prior = MultiTeacherLoss(
         actor, priors, weights, raw_critic, method=method, gamma=0.9, prior_in_batch=True, num_samples=4
     )
+    loss = ClipPPOPriorLoss(actor, critic, loss_prior)
     gae = GAE(gamma=0.9, lmbda=0.95, value_network=critic)
-    gae.set_keys(reward="shaped_reward")
-    optimizer = torch.optim.Adam(nn.ModuleList([loss, loss_prior]).parameters(), lr=0.03)
+    gae.set_keys(reward=loss.tensor_keys.reward)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=0.03)
     env.set_seed(0)
-    for batch in Collector(env, actor, frames_per_batch=128, total_frames=batches * 128, postproc=transforms):
+    collector = Collector(
+        env, actor, frames_per_batch=128, total_frames=batches * 128, postproc=prior_transforms(loss, num_samples=1)
+    )
+    for batch in collector:
         flat = gae(batch).reshape(-1)
         for _ in range(4):
             for index in torch.randperm(128).split(64):
-                losses = {**loss(flat[index]), **loss_prior(flat[index])}
+                losses = loss(flat[index])
                 objective = sum(value for key, value in losses.items() if key.startswith("loss_"))
                 assert objective.isfinite()
                 optimizer.zero_grad()
@@ -94,7 +99,7 @@ def train(
     return weights
 
 
-def sb3_teacher(folder: Any, algorithm: Any, rows: list[list[float]], std: float | None = None) -> ActionPrior:
+def sb3_teacher(folder: Any, algorithm: Any, rows: list[list[float]], std: float | None = None) -> Prior:
     """A linear policy with the given weights, by way of Stable-Baselines3's own file."""
     actions = spaces.Discrete(2) if len(rows) == 2 else spaces.Box(-2.0, 2.0, (1,), np.float32)
     off_policy = algorithm in (SAC, TD3)
@@ -177,7 +182,7 @@ class TestEachKindOfTeacher:
         assert same_tensors(before, prior.state_dict())
 
 
-def teacher(right_where: float, namespace: str) -> ActionPrior:
+def teacher(right_where: float, namespace: str) -> Prior:
     """Right where the second number has the sign of ``right_where``, wrong elsewhere; always right for 0."""
 
     def logits(x: torch.Tensor) -> torch.Tensor:
@@ -214,17 +219,18 @@ class TestSeveralTeachers:
         assert trust[0] > 2 * trust[1]
         assert accuracy(actor) > 0.8
 
-    def batch(self, priors: list[ActionPrior], weights: list[PriorWeight], actor: Any, **kwargs: Any) -> TensorDict:
+    def batch(self, loss: Any) -> TensorDict:
         env = Signs()
         env.set_seed(0)
         with torch.no_grad():
-            data = env.rollout(20, actor, break_when_any_done=False)
-        return multi_teacher_transforms(priors, weights, actor, **kwargs)(data)
+            data = env.rollout(20, loss.teachers[0].actor_network, break_when_any_done=False)
+        return prior_transforms(loss)(data)
 
     def test_the_bonuses_add_up(self) -> None:
         priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
         weights = [PriorWeight.constant(0.75), PriorWeight.constant(0.5)]
-        data = self.batch(priors, weights, actor, bonus_coeff=2.0)
+        critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+        data = self.batch(MultiTeacherLoss(actor, priors, weights, critic, bonus_coeff=2.0))
         following = data["next"]
         expected = following["reward"] + 2 * (following["north", "prior_bonus"] + following["south", "prior_bonus"])
         torch.testing.assert_close(following["shaped_reward"], expected)
@@ -235,8 +241,8 @@ class TestSeveralTeachers:
         priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
         weights = [PriorWeight(nn.Linear(3, 1)), PriorWeight(nn.Linear(3, 1), out_keys=["omega"])]
         critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
-        data = self.batch(priors, weights, actor).reshape(-1)
         loss = MultiTeacherLoss(actor, priors, weights, critic)
+        data = self.batch(loss).reshape(-1)
         losses = loss(data)
         assert set(loss.out_keys) | {"prior_bonus_north", "prior_bonus_south"} == set(losses.keys())
         for name, prior, weight in zip(("north", "south"), priors, weights, strict=True):
@@ -255,6 +261,56 @@ class TestSeveralTeachers:
         gradient = torch.autograd.grad(once(data)["loss_prior_critic"], critic.module.weight)[0]
         torch.testing.assert_close(critic.module.weight.grad, gradient)
 
+    @pytest.mark.parametrize("functional", [True, False])
+    def test_ppo_around_them_has_their_losses_and_runs_the_student_once(self, functional: bool) -> None:
+        priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
+        weights = [PriorWeight(nn.Linear(3, 1)) for _ in priors]
+        critic, raw_critic = (ValueOperator(nn.Linear(3, 1), in_keys=["observation"]) for _ in range(2))
+        prior_loss = MultiTeacherLoss(actor, priors, weights, raw_critic, functional=functional)
+        loss = ClipPPOPriorLoss(actor, critic, prior_loss)
+        data = GAE(gamma=0.99, lmbda=0.95, value_network=critic)(self.batch(prior_loss)).reshape(-1)
+        calls: list[int] = []
+        actor.module[0].module.register_forward_hook(lambda *_: calls.append(1))
+        losses = loss(data)
+        assert len(calls) == 1
+        assert set(loss.out_keys) <= set(losses.keys())
+        both = {**ClipPPOLoss(actor, critic, functional=functional)(data), **prior_loss(data)}
+        for name, value in both.items():
+            torch.testing.assert_close(losses[name], value)
+        parameters = {p for network in (actor, critic, raw_critic, *weights) for p in network.parameters()}
+        assert {p for p in loss.parameters() if p.requires_grad} == parameters
+        loss.make_value_estimator(gamma=0.5)
+        assert [part.gamma.item() for part in prior_loss.teachers] == [0.5, 0.5]
+
+    @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")  # the trainer is experimental
+    def test_torchrls_trainer_learns_from_both(self) -> None:
+        torch.manual_seed(0)
+        priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
+        weights = [PriorWeight(nn.Linear(3, 1)) for _ in priors]
+        critic, raw_critic = (ValueOperator(nn.Linear(3, 1), in_keys=["observation"]) for _ in range(2))
+        loss = ClipPPOPriorLoss(actor, critic, MultiTeacherLoss(actor, priors, weights, raw_critic, gamma=0.9))
+        env = Signs()
+        env.set_seed(0)
+        trainer = PPOTrainer(
+            collector=Collector(env, actor, frames_per_batch=64, total_frames=128),
+            total_frames=128,
+            frame_skip=1,
+            optim_steps_per_batch=1,
+            num_epochs=2,
+            loss_module=loss,
+            optimizer=torch.optim.Adam(loss.parameters(), lr=0.03),
+            replay_buffer=TensorDictReplayBuffer(
+                storage=LazyTensorStorage(64), sampler=SamplerWithoutReplacement(), batch_size=32
+            ),
+            reward_key=loss.tensor_keys.reward,
+            progress_bar=False,
+            enable_logging=False,
+        )
+        PriorShaping().register(trainer)
+        before = copy.deepcopy([weight.state_dict() for weight in weights])
+        trainer.train()
+        assert not any(same_tensors(old, weight.state_dict()) for old, weight in zip(before, weights, strict=True))
+
     def test_keys_are_renamed_for_all(self) -> None:
         priors, actor = [teacher(1, "north"), teacher(-1, "south")], make_actor()
         weights = [PriorWeight(nn.Linear(3, 1)), PriorWeight(nn.Linear(3, 1))]
@@ -271,6 +327,6 @@ class TestSeveralTeachers:
         with pytest.raises(ValueError, match="namespace of its own"):
             MultiTeacherLoss(actor, [prior, prior], method="kickstart")
         with pytest.raises(ValueError, match="2 teachers needs a prior weight of its own, got 1"):
-            multi_teacher_transforms([prior, teacher(-1, "south")], [weight], actor)
+            MultiTeacherLoss(actor, [prior, teacher(-1, "south")], [weight])
         with pytest.raises(ValueError, match="weight of its own"):
-            multi_teacher_transforms([prior, teacher(-1, "south")], [weight, weight], actor)
+            MultiTeacherLoss(actor, [prior, teacher(-1, "south")], [weight, weight])

@@ -12,8 +12,8 @@ from torch import nn
 from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.networks import ACTIVATIONS, GaussianMLP, make_actor, make_critic, make_prior_weight
-from torchrl_priors.objectives import cross_entropy
 
 OBS, ACTIONS = 5, 3
 

@@ -20,8 +20,9 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.modules import ProbabilisticActor, ValueOperator
 
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.methods import METHODS
-from torchrl_priors.objectives import AE2RLoss, cross_entropy
+from torchrl_priors.objectives import AE2RLoss
 
 ADAPTIVE = [name for name, spec in METHODS.items() if spec.adaptive]
 
@@ -68,13 +69,11 @@ def two_states():
         {
             "state": state,
             "prior_log_prob": torch.tensor([[-1.0], [-2.0]]),
-            "prior_center": torch.tensor([[0.5], [1.5]]),
             "next": {
                 "state": state.flip(0),
                 "reward": torch.tensor([[1.0], [3.0]]),
                 "terminated": torch.tensor([[False], [True]]),
                 "prior_log_prob": torch.tensor([[-2.0], [0.0]]),
-                "prior_center": torch.tensor([[1.5], [9.0]]),  # 9: of no state, must not count
             },
         },
         [2],
@@ -187,19 +186,12 @@ def test_a_share_of_the_entropy_is_of_the_students_cross_entropy_only():
     assert make_loss("kickstart").aux_coeff == 1
 
 
-def test_centred_bonus_by_hand(two_states):
-    networks, data = two_states
-    losses = AE2RLoss(**networks, gamma=0.5, centering="policy", bonus_coeff=2.0, reduction="none")(data)
-    # (E - w(s1) 2 (-2 + 1.5))^2 = (-1 + 3/4)^2; no centre after the end
-    torch.testing.assert_close(losses["loss_prior_weight"], torch.tensor([0.0625, 1.0]))
-
-
 # ---------------------------------------------------------------------------------------------------------------------
 # A loop over steps, every combination of settings
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def loop(loss, data, spec, td_error, weight_target, centering, coeff):
+def loop(loss, data, spec, td_error, weight_target, coeff):
     """The losses step by step in plain Python numbers."""
     out = {"loss_prior": [], "loss_prior_weight": [], "loss_prior_critic": []}
     with torch.no_grad():
@@ -215,17 +207,12 @@ def loop(loss, data, spec, td_error, weight_target, centering, coeff):
             alive = 0.0 if step["next", "terminated"].item() else 1.0
             target = step["next", "reward"].item() + 0.9 * alive * v_next
             log_prob, next_log_prob = step["prior_log_prob"].item(), step["next", "prior_log_prob"].item()
-            if centering != "none":
-                log_prob_c = log_prob + step["prior_center"].item()
-                next_log_prob_c = next_log_prob + step["next", "prior_center"].item()
-            else:
-                log_prob_c, next_log_prob_c = log_prob, next_log_prob
             if weight_target == "advantage":
                 y, signal, at = target - v, log_prob + entropy, w
             elif spec.bonus == "next":
-                y, signal, at = v - target, coeff * alive * next_log_prob_c, w_next
+                y, signal, at = v - target, coeff * alive * next_log_prob, w_next
             else:
-                y, signal, at = v - target, coeff * log_prob_c, w
+                y, signal, at = v - target, coeff * log_prob, w
             if spec.auxiliary:
                 pull = entropy
                 if spec.cross_entropy == "teacher":
@@ -238,13 +225,12 @@ def loop(loss, data, spec, td_error, weight_target, centering, coeff):
     return {key: torch.tensor(value) for key, value in out.items() if value}
 
 
-@pytest.mark.parametrize("centering", ["none", "prior"])
 @pytest.mark.parametrize("weight_target", ["td", "advantage"])
 @pytest.mark.parametrize("td_error", ["original", "shaped"])
 @pytest.mark.parametrize("method", METHODS)
-def test_losses_are_those_of_a_loop_over_steps(method, td_error, weight_target, centering):
+def test_losses_are_those_of_a_loop_over_steps(method, td_error, weight_target):
     spec = METHODS[method]
-    options = {"td_error": td_error, "weight_target": weight_target, "centering": centering, "bonus_coeff": 0.5}
+    options = {"td_error": td_error, "weight_target": weight_target, "bonus_coeff": 0.5}
     options |= {"aux_coeff": 3.0, "weight_coeff": 5.0, "critic_coeff": 7.0, "gamma": 0.9}
     if spec.adaptive and (
         (weight_target == "td" and spec.bonus == "none")
@@ -259,7 +245,7 @@ def test_losses_are_those_of_a_loop_over_steps(method, td_error, weight_target, 
         assert loss.critic_network is None
         loss.__dict__.update(prior_weight=make_weight(), critic_network=make_critic())  # for the loop only
     data = make_batch()
-    expected = loop(loss, data, spec, td_error, weight_target, centering, coeff=0.5)
+    expected = loop(loss, data, spec, td_error, weight_target, coeff=0.5)
     losses = loss(data)
     assert loss_names(losses) == expected.keys()
     for key, value in expected.items():

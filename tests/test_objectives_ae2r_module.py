@@ -18,7 +18,6 @@ DEFAULT_KEYS = {
     "value": "state_value",
     "prior_weight": "prior_weight",
     "prior_log_prob": "prior_log_prob",
-    "prior_center": "prior_center",
     "prior_bonus": "prior_bonus",
     "raw_advantage": "raw_advantage",
 }
@@ -45,8 +44,7 @@ def test_unknown_keys_are_refused():
     "name", [lambda key: f"my_{key}", lambda key: ("agents", "first", key)], ids=["flat", "nested"]
 )
 def test_renamed_keys_give_the_same_losses(method, name):
-    options = {"method": method, "centering": "none" if method == "aligned" else "policy"}
-    loss = make_loss(**options)
+    loss = make_loss(method)
     data = make_batch()
     data["raw_advantage"] = data["advantage"] + 1
     expected = loss(data)
@@ -54,11 +52,11 @@ def test_renamed_keys_give_the_same_losses(method, name):
     weight, critic = make_weight(weight=name("prior_weight")), make_critic(value=name("state_value"))
     weight.load_state_dict(loss.get_stateful_net("prior_weight").state_dict())
     critic.load_state_dict(loss.get_stateful_net("critic_network").state_dict())
-    renamed = AE2RLoss(loss.actor_network, loss.prior, weight, critic, **options)
+    renamed = AE2RLoss(loss.actor_network, loss.prior, weight, critic, method=method)
     renamed.set_keys(**{key: name(default) for key, default in DEFAULT_KEYS.items()})
-    for key in ("reward", "terminated", "prior_log_prob", "prior_center", "prior_bonus"):
+    for key in ("reward", "terminated", "prior_log_prob", "prior_bonus"):
         data.rename_key_(("next", key), ("next", *(new if isinstance(new := name(key), tuple) else (new,))))
-    for key in ("prior_log_prob", "prior_center", "raw_advantage"):
+    for key in ("prior_log_prob", "raw_advantage"):
         data.rename_key_(key, name(key))
     losses = renamed(data)
     assert same_tensors(dict(losses.items()), dict(expected.items()))
@@ -71,11 +69,10 @@ def test_nested_observations():
     assert ("next", "agents", "observation") in loss.in_keys
 
 
-@pytest.mark.parametrize("centering", ["none", "policy"])
 @pytest.mark.parametrize("td_error", ["original", "shaped"])
 @pytest.mark.parametrize("method", METHODS)
-def test_in_keys_are_all_that_is_read(method, td_error, centering):
-    loss = make_loss(method, td_error=td_error, centering=centering)
+def test_in_keys_are_all_that_is_read(method, td_error):
+    loss = make_loss(method, td_error=td_error)
     data = make_batch()
     data["raw_advantage"] = data["advantage"]
     data["next"].pop("prior_bonus")
@@ -258,8 +255,6 @@ def test_methods_without_a_loss_have_none(method):
         ({"method": "a2er"}, "Unknown method"),
         ({"td_error": "raw"}, "td_error"),
         ({"weight_target": "return"}, "weight_target"),
-        ({"centering": "mean"}, "centering"),
-        ({"loss_critic_type": "l3"}, "loss_critic_type"),
         ({"gamma": 1.5}, "gamma"),
         ({"aux_coeff": "1"}, "aux_coeff"),
         ({"prior_weight": None}, "pass prior_weight"),

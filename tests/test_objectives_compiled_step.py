@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 import torch
-from objectives_cases import OBS, make_actor, make_batch, make_critic
+from objectives_cases import OBS, make_actor, make_batch, make_critic, make_ppo_prior
 from torch import nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss
@@ -36,7 +36,8 @@ def make_loss(kind="normal", method="ae2r", **kwargs):
     if method == "none":
         return AVECClipPPO(actor, critic, **kwargs)
     weight, raw_critic = PriorWeight(mlp()), ValueOperator(mlp(), in_keys=["observation"])
-    return AVECClipPPOPrior(actor, critic, ActionPrior(make_actor(kind)), weight, raw_critic, method=method, **kwargs)
+    prior = ActionPrior(make_actor(kind))
+    return make_ppo_prior(actor, critic, prior, weight, raw_critic, AVECClipPPOPrior, method=method, **kwargs)
 
 
 def make_adam(loss, lr=1e-2, **kwargs):

@@ -14,6 +14,7 @@ from objectives_cases import (
     make_batch,
     make_constant_weight,
     make_critic,
+    make_ppo_prior,
     make_weight,
     same_tensors,
     total,
@@ -27,16 +28,16 @@ from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss
 
 def make_networks(kind="categorical"):
     return {
-        "actor_network": make_actor(kind),
-        "critic_network": make_critic(),
+        "actor": make_actor(kind),
+        "critic": make_critic(),
         "prior": make_actor(kind),
         "prior_weight": make_weight(),
-        "prior_critic_network": make_critic(),
+        "prior_critic": make_critic(),
     }
 
 
 def make_loss(method="ae2r", kind="categorical", **kwargs):
-    return ClipPPOPriorLoss(**{**make_networks(kind), "method": method, **kwargs})
+    return make_ppo_prior(**{**make_networks(kind), "method": method, **kwargs})
 
 
 def train(loss, data, networks, steps=5):
@@ -64,7 +65,7 @@ def test_a_weight_of_zero_is_plain_ppo_bit_by_bit(kind, method, functional):
     plain_actor, plain_critic = copy.deepcopy(actor), copy.deepcopy(critic)
     options = {"functional": functional, "normalize_advantage": True, "entropy_coeff": 0.01}
     weight = make_constant_weight(0.0)
-    loss = ClipPPOPriorLoss(actor, critic, make_actor(kind), weight, prior_critic, method=method, **options)
+    loss = make_ppo_prior(actor, critic, make_actor(kind), weight, prior_critic, method=method, **options)
     plain = ClipPPOLoss(plain_actor, plain_critic, **options)
     history, parameters = train(loss, data, [actor, critic, prior_critic])
     plain_history, plain_parameters = train(plain, data, [plain_actor, plain_critic])
@@ -79,8 +80,8 @@ def test_a_weight_of_zero_is_plain_ppo_bit_by_bit(kind, method, functional):
 def test_a_weight_of_one_is_e2r_bit_by_bit(kind):
     actor, critic, prior, data = make_actor(kind), make_critic(), make_actor(kind), make_batch(kind)
     twin_actor, twin_critic = copy.deepcopy(actor), copy.deepcopy(critic)
-    ae2r = ClipPPOPriorLoss(actor, critic, prior, make_constant_weight(1.0), make_critic(), method="ae2r")
-    e2r = ClipPPOPriorLoss(twin_actor, twin_critic, prior, method="e2r")
+    ae2r = make_ppo_prior(actor, critic, prior, make_constant_weight(1.0), make_critic(), method="ae2r")
+    e2r = make_ppo_prior(twin_actor, twin_critic, prior, method="e2r")
     history, parameters = train(ae2r, data, [actor, critic])
     e2r_history, e2r_parameters = train(e2r, data, [twin_actor, twin_critic])
     for (losses, grads), (e2r_losses, e2r_grads) in zip(history, e2r_history, strict=True):
@@ -92,12 +93,12 @@ def test_a_weight_of_one_is_e2r_bit_by_bit(kind):
 @pytest.mark.parametrize("method", ["e2r", "kickstart", "ae2r", "aligned"])
 def test_the_teacher_changes_the_students_gradient(method):
     networks, data = make_networks(), make_batch()
-    total(ClipPPOLoss(networks["actor_network"], networks["critic_network"])(data)).backward()
-    plain = [gradients(networks[name]) for name in ("actor_network", "critic_network")]
+    total(ClipPPOLoss(networks["actor"], networks["critic"])(data)).backward()
+    plain = [gradients(networks[name]) for name in ("actor", "critic")]
     for network in networks.values():
         network.zero_grad()
-    total(ClipPPOPriorLoss(**networks, method=method)(data)).backward()
-    actor, critic = (gradients(networks[name]) for name in ("actor_network", "critic_network"))
+    total(make_ppo_prior(**networks, method=method)(data)).backward()
+    actor, critic = (gradients(networks[name]) for name in ("actor", "critic"))
     assert not any(torch.equal(actor[name], plain[0][name]) for name in actor)
     assert same_tensors(critic, plain[1])
 
@@ -105,7 +106,7 @@ def test_the_teacher_changes_the_students_gradient(method):
 def test_teacher_never_changes():
     networks, data = make_networks(), make_batch()
     before = copy.deepcopy(dict(networks["prior"].named_parameters()))
-    loss = ClipPPOPriorLoss(**networks)
+    loss = make_ppo_prior(**networks)
     optimizer = torch.optim.AdamW(loss.parameters(), lr=0.1, weight_decay=0.1)
     for _ in range(3):
         optimizer.zero_grad()
@@ -115,12 +116,12 @@ def test_teacher_never_changes():
 
 
 REACHED = {
-    "loss_objective": {"actor_network"},
-    "loss_entropy": {"actor_network"},
-    "loss_critic": {"critic_network"},
-    "loss_prior": {"actor_network"},
+    "loss_objective": {"actor"},
+    "loss_entropy": {"actor"},
+    "loss_critic": {"critic"},
+    "loss_prior": {"actor"},
     "loss_prior_weight": {"prior_weight"},
-    "loss_prior_critic": {"prior_critic_network"},
+    "loss_prior_critic": {"prior_critic"},
 }
 
 
@@ -129,7 +130,7 @@ REACHED = {
 @pytest.mark.parametrize("method", METHODS)
 def test_each_loss_reaches_its_own_network_only(method, td_error, functional):
     networks, data = make_networks(), make_batch()
-    loss = ClipPPOPriorLoss(**networks, method=method, td_error=td_error, functional=functional)
+    loss = make_ppo_prior(**networks, method=method, td_error=td_error, functional=functional)
     for key in loss_names(loss(data)):
         for network in networks.values():
             network.zero_grad()
@@ -144,11 +145,11 @@ def test_each_loss_reaches_its_own_network_only(method, td_error, functional):
 @pytest.mark.parametrize("method", METHODS)
 def test_its_losses_are_those_of_the_two_modules(method, td_error):
     networks, data = make_networks(), make_batch()
-    losses = ClipPPOPriorLoss(**networks, method=method, td_error=td_error, aux_coeff=0.3, gamma=0.9)(data)
-    ppo = ClipPPOLoss(networks["actor_network"], networks["critic_network"])(data)
-    critic = networks["prior_critic_network" if td_error == "original" else "critic_network"]
+    losses = make_ppo_prior(**networks, method=method, td_error=td_error, aux_coeff=0.3, gamma=0.9)(data)
+    ppo = ClipPPOLoss(networks["actor"], networks["critic"])(data)
+    critic = networks["prior_critic" if td_error == "original" else "critic"]
     prior = AE2RLoss(
-        *(networks[name] for name in ("actor_network", "prior", "prior_weight")),
+        *(networks[name] for name in ("actor", "prior", "prior_weight")),
         critic,
         method=method,
         td_error=td_error,
@@ -160,7 +161,7 @@ def test_its_losses_are_those_of_the_two_modules(method, td_error):
 
 def test_every_parameter_is_listed_once():
     networks = make_networks()
-    loss = ClipPPOPriorLoss(**networks)
+    loss = make_ppo_prior(**networks)
     parameters = list(loss.parameters())
     assert len(parameters) == len(set(parameters))
     assert set(parameters) == {p for network in networks.values() for p in network.parameters()}
@@ -184,8 +185,8 @@ def test_an_unshaped_batch_is_refused_rather_than_trained_on():
 def test_own_advantages_are_estimated_from_the_shaped_reward():
     networks, data = make_networks(), make_batch(batch=(2, 5))
     data = data.exclude("advantage", "value_target")
-    loss = ClipPPOPriorLoss(**networks, gamma=0.7)
-    gae = GAE(gamma=0.7, lmbda=0.95, value_network=networks["critic_network"])
+    loss = make_ppo_prior(**networks, gamma=0.7)
+    gae = GAE(gamma=0.7, lmbda=0.95, value_network=networks["critic"])
     gae.set_keys(reward="shaped_reward")
     expected = loss(gae(data.copy()))
     losses = loss(data)
@@ -208,30 +209,30 @@ def test_reward_key_that_hides_the_bonus_warns():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_loss("kickstart").set_keys(reward="reward")
-        make_loss("e2r").set_keys(reward="my_reward", raw_reward="raw")
+        make_loss("e2r").set_keys(reward="my_reward")
 
 
-def test_keys_reach_both_losses():
+def test_each_loss_has_its_keys_and_the_end_is_one():
     loss = make_loss()
-    loss.set_keys(
-        reward=("a", "shaped"),
-        raw_reward=("a", "raw"),
-        terminated="end",
-        value="v",
-        raw_value="raw_v",
-        prior_log_prob="lp",
-        prior_center="c",
-        prior_bonus="b",
-        prior_weight="w",
-        raw_advantage="adv",
-    )
-    inner = loss.prior_loss.tensor_keys
-    assert (inner.reward, inner.terminated, inner.value) == (("a", "raw"), "end", "raw_v")
-    assert (inner.prior_log_prob, inner.prior_center, inner.prior_bonus) == ("lp", "c", "b")
-    assert (inner.prior_weight, inner.raw_advantage) == ("w", "adv")
-    assert loss.tensor_keys.reward == ("a", "shaped")
-    assert ("next", "a", "raw") in loss.in_keys
-    assert ("next", "lp") in loss.in_keys
+    loss.set_keys(reward=("a", "shaped"), terminated="end", value="v")
+    loss.prior_loss.set_keys(reward=("a", "raw"), prior_log_prob="lp", prior_weight="w")
+    assert loss.prior_loss.tensor_keys.terminated == "end"
+    assert (loss.tensor_keys.reward, loss.prior_loss.tensor_keys.value) == (("a", "shaped"), "state_value")
+    assert {("next", "a", "raw"), ("next", "lp"), ("next", "end")} <= set(loss.in_keys)
+    assert ("next", "reward") not in loss.in_keys
+    with pytest.raises(ValueError, match="not an accepted"):
+        loss.set_keys(prior_log_prob="lp")
+
+
+@pytest.mark.parametrize("td_error", ["original", "shaped"])
+def test_another_student_or_critic_in_the_prior_loss_is_refused(td_error):
+    actor, critic = make_actor(), make_critic()
+    options = {"prior_weight": make_weight(), "critic_network": make_critic(), "td_error": td_error}
+    with pytest.raises(ValueError, match="student of the prior's loss is another"):
+        ClipPPOPriorLoss(actor, critic, AE2RLoss(make_actor(), make_actor(), **options))
+    if td_error == "shaped":
+        with pytest.raises(ValueError, match="critic of the prior's loss is another"):
+            ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, make_actor(), **options))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -294,7 +295,7 @@ def test_deep_copy_keeps_parameters_shared_inside():
 def test_reset_leaves_the_prior_alone(functional):
     networks = make_networks()
     before = {name: copy.deepcopy(network.state_dict()) for name, network in networks.items()}
-    ClipPPOPriorLoss(**networks, functional=functional).reset_parameters_recursive()
+    make_ppo_prior(**networks, functional=functional).reset_parameters_recursive()
     for name, network in networks.items():
         for key, value in network.state_dict().items():
             assert torch.equal(value, before[name][key]) == (name == "prior")
@@ -317,8 +318,9 @@ def test_avec_and_prior_combine():
         pass
 
     networks, data = make_networks(), make_batch()
-    losses, plain = Loss(**networks)(data), ClipPPOPriorLoss(**networks, loss_critic_type="l2")(data)
-    error = networks["critic_network"](data.copy())["state_value"] - data["value_target"]
+    losses = make_ppo_prior(**networks, loss_class=Loss)(data)
+    plain = make_ppo_prior(**networks, loss_critic_type="l2")(data)
+    error = networks["critic"](data.copy())["state_value"] - data["value_target"]
     torch.testing.assert_close(losses["loss_critic"], error.var(correction=0))
     for key in loss_names(plain) - {"loss_critic"}:
         assert torch.equal(losses[key], plain[key])
@@ -337,4 +339,4 @@ def test_bad_options_are_refused():
     with pytest.raises(ValueError, match="Unknown method"):
         make_loss("ppo")
     with pytest.raises(ValueError, match="pass critic_network"):
-        make_loss(prior_critic_network=None)
+        make_loss(prior_critic=None)

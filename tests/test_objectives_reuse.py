@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from objectives_cases import make_actor, make_batch, make_critic, make_weight
+from objectives_cases import make_actor, make_batch, make_critic, make_ppo_prior, make_weight
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_priors import ActionPrior, PriorLogProb, RandomDegradation, StructuralDegradation
-from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss
+from torchrl_priors.objectives import AE2RLoss, AVECMixin
 
 PRIORS = {
     "plain": lambda prior: prior,
@@ -89,7 +89,7 @@ def test_only_an_action_prior_says_where_its_advice_is():
 
 @pytest.mark.parametrize("functional", [True, False])
 def test_the_student_runs_once_and_is_forgotten(functional):
-    loss = ClipPPOPriorLoss(make_actor(), make_critic(), make_actor(), method="kickstart", functional=functional)
+    loss = make_ppo_prior(make_actor(), make_critic(), make_actor(), method="kickstart", functional=functional)
     calls = count_calls(loss.actor_network.module[0])
     loss(make_batch())
     assert len(calls) == 1
@@ -102,7 +102,7 @@ def test_the_student_runs_once_and_is_forgotten(functional):
 def test_delayed_parameters_are_not_the_students():
     torch.manual_seed(0)
     actor, critic, prior = make_actor(), make_critic(), make_actor()
-    loss = ClipPPOPriorLoss(actor, critic, prior, method="kickstart", delay_actor=True)
+    loss = make_ppo_prior(actor, critic, prior, method="kickstart", delay_actor=True)
     batch = make_batch()
     for parameter in loss.actor_network_params.values(True, True):
         parameter.data += 1.0 + torch.rand_like(parameter)  # the target parameters stay behind

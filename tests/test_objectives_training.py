@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from objectives_cases import loss_names, make_batch, make_critic, same_tensors, total
+from objectives_cases import loss_names, make_batch, make_critic, make_ppo_prior, same_tensors, total
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -73,7 +73,8 @@ def make_all(method="ae2r", loss_class=ClipPPOPriorLoss, prior=None, **kwargs):
     critic = ValueOperator(nn.Sequential(nn.Linear(3, 1), ValueOffset()), in_keys=["observation"])
     weight = PriorWeight(nn.Linear(3, 1)) if METHODS[method].adaptive else None
     prior = ActionPrior(make_actor(weight=4.0)) if prior is None else prior
-    loss = loss_class(actor, critic, prior, weight, make_critic(), method=method, gamma=0.9, **kwargs)
+    options = {"method": method, "gamma": 0.9, **kwargs}
+    loss = make_ppo_prior(actor, critic, prior, weight, make_critic(), loss_class, **options)
     postproc = Compose(PriorLogProb(prior, actor), PriorBonus.from_method(method, weight))
     return actor, critic, prior, loss, postproc
 

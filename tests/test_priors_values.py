@@ -21,8 +21,8 @@ from torchrl.modules import (
     QValueActor,
 )
 
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.lookup import StateTable
-from torchrl_priors.objectives.cross_entropy import cross_entropy
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
 
 

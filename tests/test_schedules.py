@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from objectives_cases import make_actor, make_batch, make_critic
+from objectives_cases import make_actor, make_batch, make_critic, make_ppo_prior
 from torchrl.objectives import A2CLoss
 from torchrl.trainers import Trainer
 from trajectories import actor, prior, trajectories
@@ -15,7 +15,6 @@ from trajectories import actor, prior, trajectories
 from torchrl_priors import (
     ActionPrior,
     AE2RLoss,
-    ClipPPOPriorLoss,
     CoeffScheduler,
     CosineSchedule,
     LinearSchedule,
@@ -92,7 +91,7 @@ def test_the_bonus_and_a_loss_of_torchrl_can_be_scheduled_too():
 
 
 def test_coefficients_of_submodules_have_dotted_names():
-    loss = ClipPPOPriorLoss(make_actor(), make_critic(), make_actor(), method="kickstart")
+    loss = make_ppo_prior(make_actor(), make_critic(), make_actor(), method="kickstart")
     CoeffScheduler(loss, "prior_loss.aux_coeff", ANNEAL).step(400)
     assert loss.prior_loss.aux_coeff == 0.5
 

@@ -112,39 +112,15 @@ class TestShift:
         torch.testing.assert_close(sampled.squeeze(-1), PRIOR_LOGITS[2][actions])
         torch.testing.assert_close(sampled.mean(), -CROSS_ENTROPY[2], atol=0.03, rtol=0)
 
-    @pytest.mark.parametrize("centering", ["policy", "prior"])
-    @pytest.mark.parametrize("boundary", ["expected", "sample", "zero"])
-    def test_center_is_shifted_like_the_log_prob(self, centering: Any, boundary: Any) -> None:
-        batch = trajectories(3, 8, seed=5, ids=True)
-        entropy = -(PRIOR_LOGITS.exp() * PRIOR_LOGITS).sum(-1)
-        center = CROSS_ENTROPY if centering == "policy" else entropy
-        PriorLogProb(prior(), actor(), time_dim=1, boundary=boundary, centering=centering)(batch)
-        torch.testing.assert_close(batch["prior_center"], center[batch["state"]].unsqueeze(-1))
-        log_prob, shifted = batch["next", "prior_log_prob"], batch["next", "prior_center"]
-        marked = batch.clone()
-        at_boundary = torch.isinf(loop_over_time(marked, 1, lambda step: torch.inf))
-        goes_on = ~at_boundary & ~batch["next", "terminated"]
-        assert at_boundary.any()
-        assert goes_on.any()
-        assert (shifted[batch["next", "terminated"]] == 0).all()
-        following = torch.cat([batch["prior_center"][:, 1:], batch["prior_center"][:, :1]], 1)
-        torch.testing.assert_close(shifted[goes_on], following[goes_on])
-        of_next = center[batch["next", "state"]].unsqueeze(-1)
-        expected = torch.zeros_like(of_next) if boundary == "zero" else of_next
-        torch.testing.assert_close(shifted[at_boundary], expected[at_boundary])
-        if centering == "policy" and boundary == "expected":  # the centred bonus is 0 in the mean, here exactly
-            torch.testing.assert_close((log_prob + shifted)[at_boundary], torch.zeros(int(at_boundary.sum())))
-
     def test_worlds_with_tables_of_their_own(self) -> None:
         q, logits = table(4), table(4).flip(0)
         batch = trajectories(4, 6, seed=2)
-        whole = PriorLogProb(BoltzmannPrior(q), tabular_actor(logits), time_dim=1, centering="policy")(batch.clone())
+        whole = PriorLogProb(BoltzmannPrior(q), tabular_actor(logits), time_dim=1)(batch.clone())
         for world in range(4):
-            one = PriorLogProb(BoltzmannPrior(q[world]), tabular_actor(logits[world]), time_dim=0, centering="policy")
+            one = PriorLogProb(BoltzmannPrior(q[world]), tabular_actor(logits[world]), time_dim=0)
             alone = one(batch[world].clone())
-            for key in ("prior_log_prob", "prior_center"):
+            for key in ("prior_log_prob", ("next", "prior_log_prob")):
                 torch.testing.assert_close(whole[world][key], alone[key])
-                torch.testing.assert_close(whole[world]["next", key], alone["next", key])
 
     def test_padding_is_no_next_step(self) -> None:
         batch = trajectories(2, 5, ends=0.0)
@@ -186,17 +162,10 @@ class TestShift:
         batch["observation"], batch["next", "observation"] = torch.randn(2, 5, 2), torch.randn(2, 5, 2)
         batch["action"] = student(batch.clone())["action"].detach()
         keys = set(batch.keys(True, True))
-        out = PriorLogProb(teacher, student, time_dim=1, num_samples=4, centering="policy")(batch)
-        assert (
-            out["prior_log_prob"].shape == out["next", "prior_log_prob"].shape == out["prior_center"].shape == (2, 5, 1)
-        )
+        out = PriorLogProb(teacher, student, time_dim=1, num_samples=4)(batch)
+        assert out["prior_log_prob"].shape == out["next", "prior_log_prob"].shape == (2, 5, 1)
         torch.testing.assert_close(out["prior_log_prob"].squeeze(-1), teacher.log_prob(out))
-        assert set(out.keys(True, True)) - keys == {
-            "prior_log_prob",
-            "prior_center",
-            ("next", "prior_log_prob"),
-            ("next", "prior_center"),
-        }
+        assert set(out.keys(True, True)) - keys == {"prior_log_prob", ("next", "prior_log_prob")}
         if distribution_class is not TanhNormal:
             mine = student.get_dist(out[:, -1]["next"].copy())
             theirs = teacher.get_dist(out[:, -1]["next"])
@@ -207,7 +176,7 @@ class TestShift:
 
     def test_no_gradient(self) -> None:
         student = tabular_actor(nn.Parameter(ACTOR_TABLE.clone()))
-        batch = PriorLogProb(prior(), student, time_dim=1, centering="policy")(trajectories(2, 5))
+        batch = PriorLogProb(prior(), student, time_dim=1)(trajectories(2, 5))
         PriorBonus(PriorWeight.table(STATES))(batch)
         assert not any(value.requires_grad for value in batch.values(True, True))
 

@@ -252,41 +252,36 @@ class TestKeysAndErrors:
             teacher,
             student,
             time_dim=1,
-            centering="policy",
-            out_keys=[("agent", "lp"), ("agent", "c")],
+            out_keys=[("agent", "lp")],
             done_key=("agent", "done"),
             terminated_key=("agent", "terminated"),
             traj_key=("agent", "ids"),
         )(nested)
         PriorBonus(
             PriorWeight.table(STATES, key=("agent", "state"), out_keys=[("agent", "w")]),
-            centering="policy",
             reward_key=("agent", "reward"),
             terminated_key=("agent", "terminated"),
             log_prob_key=("agent", "lp"),
-            center_key=("agent", "c"),
             out_keys=[("next", "agent", "bonus"), ("next", "agent", "shaped")],
         )(nested)
-        PriorLogProb(prior(), actor(), time_dim=1, centering="policy")(plain)
-        PriorBonus(PriorWeight.table(STATES), centering="policy")(plain)
+        PriorLogProb(prior(), actor(), time_dim=1)(plain)
+        PriorBonus(PriorWeight.table(STATES))(plain)
         assert torch.equal(nested["agent", "lp"], plain["prior_log_prob"])
-        assert torch.equal(nested["next", "agent", "c"], plain["next", "prior_center"])
+        assert torch.equal(nested["next", "agent", "lp"], plain["next", "prior_log_prob"])
         assert torch.equal(nested["next", "agent", "bonus"], plain["next", "prior_bonus"])
         assert torch.equal(nested["next", "agent", "shaped"], plain["next", "shaped_reward"])
 
     def test_boundaries_that_need_the_student_say_so(self) -> None:
-        for kwargs in ({}, {"boundary": "sample"}, {"boundary": "zero", "centering": "policy"}):
+        for kwargs in ({}, {"boundary": "sample"}):
             with pytest.raises(ValueError, match="needs the student"):
                 PriorLogProb(prior(), **kwargs)
-        PriorLogProb(prior(), boundary="zero", centering="prior", time_dim=0)(trajectories(4))
+        PriorLogProb(prior(), boundary="zero", time_dim=0)(trajectories(4))
 
     def test_unknown_settings_are_refused(self) -> None:
-        with pytest.raises(ValueError, match="Unknown boundary 'guess'"):
+        with pytest.raises(ValueError, match=r"boundary must be .*'guess'"):
             PriorLogProb(prior(), actor(), boundary="guess")
-        with pytest.raises(ValueError, match="Unknown centering 'mean'"):
-            PriorLogProb(prior(), actor(), centering="mean")
-        with pytest.raises(ValueError, match="one for a center"):
-            PriorLogProb(prior(), actor(), centering="prior", out_keys=["log_prob"])
+        with pytest.raises(ValueError, match="one key"):
+            PriorLogProb(prior(), actor(), out_keys=["log_prob", "other"])
 
     @pytest.mark.parametrize("key", ["state", "action", ("next", "terminated"), ("next", "done"), ("next", "state")])
     def test_missing_entries_are_named(self, key: str | tuple[str, ...]) -> None:

@@ -2,6 +2,7 @@
 
 from torchrl_priors.artifacts import load_prior, load_sb3_prior, save_prior
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
 from torchrl_priors.hooks import PriorShaping
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
@@ -20,7 +21,6 @@ from torchrl_priors.objectives import (
     ClipPPOPriorLoss,
     MultiTeacherLoss,
     ValueOffset,
-    cross_entropy,
 )
 from torchrl_priors.plateau import Plateau
 from torchrl_priors.prior_weight import PriorWeight
@@ -31,12 +31,13 @@ from torchrl_priors.priors import (
     CallablePrior,
     MixturePrior,
     ModulePrior,
+    Prior,
     UniformPrior,
     policy_prior,
 )
 from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
 from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
-from torchrl_priors.transforms import PriorBonus, PriorLogProb, multi_teacher_transforms
+from torchrl_priors.transforms import PriorBonus, PriorLogProb, prior_transforms
 
 __all__ = [
     "METHODS",
@@ -58,6 +59,7 @@ __all__ = [
     "MultiTeacherLoss",
     "PiecewiseSchedule",
     "Plateau",
+    "Prior",
     "PriorBonus",
     "PriorLogProb",
     "PriorShaping",
@@ -76,9 +78,9 @@ __all__ = [
     "load_prior",
     "load_sb3_prior",
     "mean_confidence_interval",
-    "multi_teacher_transforms",
     "performance_profile",
     "policy_prior",
+    "prior_transforms",
     "probability_of_improvement",
     "register_configs",
     "sample_worlds",

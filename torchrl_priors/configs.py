@@ -26,7 +26,7 @@ from torchrl_priors.artifacts import load_prior
 from torchrl_priors.hooks import PriorShaping
 from torchrl_priors.objectives import AE2RLoss, ClipPPOPriorLoss
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.priors import ActionPrior, BoltzmannPrior, Prior, UniformPrior
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 __all__ = ["register"]
@@ -58,7 +58,7 @@ def _settings(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: _plain(name, value) for name, value in settings.items()}
 
 
-def make_prior(cls: Callable[..., ActionPrior], action_key: Any = None, **settings: Any) -> ActionPrior:
+def make_prior(cls: Callable[..., Prior], action_key: Any = None, **settings: Any) -> Prior:
     """A prior, which finds the student's action under ``action_key``."""
     prior = cls(**_settings(settings))
     if action_key is not None:
@@ -66,22 +66,22 @@ def make_prior(cls: Callable[..., ActionPrior], action_key: Any = None, **settin
     return prior
 
 
-def make_action_prior(**settings: Any) -> ActionPrior:
+def make_action_prior(**settings: Any) -> Prior:
     """What ``prior: action`` builds."""
     return make_prior(ActionPrior, **settings)
 
 
-def make_boltzmann_prior(**settings: Any) -> ActionPrior:
+def make_boltzmann_prior(**settings: Any) -> Prior:
     """What ``prior: boltzmann`` builds."""
     return make_prior(BoltzmannPrior, **settings)
 
 
-def make_uniform_prior(**settings: Any) -> ActionPrior:
+def make_uniform_prior(**settings: Any) -> Prior:
     """What ``prior: uniform`` builds."""
     return make_prior(UniformPrior, **settings)
 
 
-def make_artifact_prior(**settings: Any) -> ActionPrior:
+def make_artifact_prior(**settings: Any) -> Prior:
     """What ``prior: artifact`` builds: a policy from a file."""
     return make_prior(load_prior, **settings)
 
@@ -113,9 +113,18 @@ def make_ae2r_loss(keys: Any = None, **settings: Any) -> AE2RLoss:
     return loss
 
 
-def make_clip_ppo_prior_loss(keys: Any = None, **settings: Any) -> ClipPPOPriorLoss:
-    """What ``loss: clip_ppo_prior`` builds; ``keys`` are for ``set_keys``."""
-    loss = ClipPPOPriorLoss(**_settings(settings))
+def make_clip_ppo_prior_loss(
+    actor_network: Any, critic_network: Any, prior_loss: Any, keys: Any = None, **settings: Any
+) -> ClipPPOPriorLoss:
+    """What ``loss: clip_ppo_prior`` builds; ``keys`` are for ``set_keys``.
+
+    Two references to one network in YAML are two networks: ``prior_loss``, a config of ``loss: ae2r`` with ``_partial_:
+    true``, is given this loss's student, and its critic where ``td_error: shaped``.
+    """
+    shared = {"actor_network": actor_network}
+    if prior_loss.keywords.get("td_error") == "shaped":
+        shared["critic_network"] = critic_network
+    loss = ClipPPOPriorLoss(actor_network, critic_network, prior_loss(**shared), **_settings(settings))
     loss.set_keys(**{name: nested_key(key) for name, key in (keys or {}).items()})
     return loss
 
@@ -125,7 +134,9 @@ def make_prior_shaping(**settings: Any) -> PriorShaping:
     return PriorShaping(**_settings(settings))
 
 
-def _config(make: Callable[..., Any], base: type, *sources: Callable[..., Any], **more: Any) -> type:
+def _config(
+    make: Callable[..., Any], base: type, *sources: Callable[..., Any], without: tuple[str, ...] = (), **more: Any
+) -> type:
     """A config with the parameters of ``sources`` as fields, the later ones winning."""
     parameters: dict[str, Any] = {}
     skipped = _SKIPPED - {"actor"} if base is TransformConfig else _SKIPPED  # the transforms' actor is not deprecated
@@ -134,6 +145,8 @@ def _config(make: Callable[..., Any], base: type, *sources: Callable[..., Any], 
         for name, parameter in inspect.signature(of).parameters.items():
             if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL) and name not in skipped:
                 parameters[name] = MISSING if parameter.default is parameter.empty else parameter.default
+    for name in without:
+        del parameters[name]
     fields = {**parameters, **more, "_target_": f"{__name__}.{make.__name__}", "_partial_": False}
     return make_dataclass(
         make.__name__.removeprefix("make_").title().replace("_", "") + "Config",
@@ -146,6 +159,7 @@ def _config(make: Callable[..., Any], base: type, *sources: Callable[..., Any], 
 def register() -> None:
     """Stores the configs beside TorchRL's own; see :func:`torchrl_priors.register_configs`."""
     store = ConfigStore.instance().store
+    ppo, of_prior = (PPOLoss, ClipPPOLoss, ClipPPOPriorLoss), ("functional", "gamma")
     for group, name, node in (
         ("prior", "action", _config(make_action_prior, ConfigBase, ActionPrior, action_key=None)),
         ("prior", "artifact", _config(make_artifact_prior, ConfigBase, load_prior, action_key=None)),
@@ -155,11 +169,7 @@ def register() -> None:
         ("transform", "prior_log_prob", _config(make_prior_log_prob, TransformConfig, PriorLogProb)),
         ("transform", "prior_bonus", _config(make_prior_bonus, TransformConfig, PriorBonus, method=None)),
         ("loss", "ae2r", _config(make_ae2r_loss, LossConfig, AE2RLoss, keys=None)),
-        (
-            "loss",
-            "clip_ppo_prior",
-            _config(make_clip_ppo_prior_loss, LossConfig, PPOLoss, ClipPPOLoss, ClipPPOPriorLoss, keys=None),
-        ),
+        ("loss", "clip_ppo_prior", _config(make_clip_ppo_prior_loss, LossConfig, *ppo, without=of_prior, keys=None)),
         ("hook", "prior_shaping", _config(make_prior_shaping, HookConfig, PriorShaping)),
     ):
         store(group=group, name=name, node=node, provider="torchrl_priors")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,28 +13,28 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 
+from torchrl_priors.keys import read
 from torchrl_priors.lookup import StateTable
-from torchrl_priors.priors import ActionPrior
-from torchrl_priors.priors.action_prior import NegatedPrior
+from torchrl_priors.priors.prior import NegatedPrior, Prior, PriorWrapper
 
 __all__ = ["Degradation", "RandomDegradation", "StructuralDegradation"]
 
 
-class Degradation(ActionPrior):
+class Degradation(PriorWrapper):
     """A prior whose advice is an adversary's wherever :meth:`mask` says so: the base of the degradations.
 
     Args:
-        prior (ActionPrior): the good advice.
-        adversary (ActionPrior, optional): the bad advice, a distribution with the same parameters. Defaults to
-            ``None``: the negated advice, see :meth:`ActionPrior.adversary`.
+        prior (Prior): the good advice.
+        adversary (Prior, optional): the bad advice, a distribution with the same parameters. Defaults to
+            ``None``: the negated advice, see :meth:`Prior.adversary`.
 
     Raises:
         ValueError: the adversary's distribution has other parameters than the prior's.
         NotImplementedError: no adversary is given, and the prior has none.
     """
 
-    def __init__(self, prior: ActionPrior, adversary: ActionPrior | None = None) -> None:
-        super().__init__(prior, namespace=prior.namespace)
+    def __init__(self, prior: Prior, adversary: Prior | None = None) -> None:
+        super().__init__(prior)
         adversary = prior.adversary() if adversary is None else adversary
         if adversary.param_names != self.param_names:
             raise ValueError(
@@ -64,7 +65,7 @@ class Degradation(ActionPrior):
     def get_params(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         """The parameters of the distribution by name: the adversary's where the mask is true."""
         mask = self.mask(tensordict)
-        good = super().get_params(tensordict)
+        good = self.module.get_params(tensordict)
         if isinstance(self.bad_advice, NegatedPrior) and self.bad_advice.module is self.module:
             bad = self.bad_advice.negate(good)  # the policy need not run twice
         else:
@@ -85,14 +86,14 @@ class StructuralDegradation(Degradation):
     The structural setting of Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer".
 
     Args:
-        prior (ActionPrior): the good advice.
+        prior (Prior): the good advice.
         degraded (Tensor, NestedKey, Callable or TensorDictModule): which states are degraded:
 
             * a bool tensor ``[S]`` or ``[*W, S]`` (one mask for each world of a batch), indexed by the integer states
               under ``state_key``;
             * the key of a bool entry ``[*B]`` or ``[*B, 1]``;
             * a function of the tensordict, or a TensorDict module that writes its first key, returning the same.
-        adversary (ActionPrior, optional): as in :class:`Degradation`.
+        adversary (Prior, optional): as in :class:`Degradation`.
 
     Keyword Args:
         state_key (NestedKey): where a table of states finds its integers. Defaults to ``"state"``.
@@ -113,36 +114,29 @@ class StructuralDegradation(Degradation):
 
     def __init__(
         self,
-        prior: ActionPrior,
+        prior: Prior,
         degraded: Tensor | NestedKey | Callable[[TensorDictBase], Tensor] | TensorDictModuleBase,
-        adversary: ActionPrior | None = None,
+        adversary: Prior | None = None,
         *,
         state_key: NestedKey = "state",
     ) -> None:
         super().__init__(prior, adversary)
-        self._function: Callable[[TensorDictBase], Any]
         if isinstance(degraded, Tensor):
             _check_bool(degraded)
             degraded = StateTable(degraded, in_key=state_key, out_key="degraded")
+        elif not callable(degraded):
+            self._read_too([degraded := unravel_key(degraded)])
+            degraded = partial(read, key=degraded, hint="it says which states are degraded")
+        self.degraded = degraded
         if isinstance(degraded, TensorDictModuleBase):
             self.degraded = deepcopy(degraded).requires_grad_(False).eval()
             self._read_too(degraded.in_keys)
-        elif callable(degraded):
-            self._function = degraded
-        else:
-            self._mask_key = unravel_key(degraded)
-            self._read_too([self._mask_key])
 
     def mask(self, tensordict: TensorDictBase) -> Tensor:
         """Which of the states of ``tensordict`` are degraded: bool, ``[*B]`` or ``[*B, 1]``."""
-        if hasattr(self, "_mask_key"):
-            mask = tensordict.get(self._mask_key, None)
-            if mask is None:
-                raise KeyError(f"The mask of degraded states is missing: no {self._mask_key!r} in the tensordict.")
-        elif hasattr(self, "_function"):
-            mask = self._function(tensordict.copy())
-        else:
-            mask = self.degraded(tensordict.copy()).get(self.degraded.out_keys[0])
+        mask: Any = self.degraded(tensordict.copy())
+        if isinstance(self.degraded, TensorDictModuleBase):
+            mask = mask.get(self.degraded.out_keys[0])
         _check_bool(mask)
         return mask
 
@@ -155,20 +149,18 @@ class RandomDegradation(Degradation):
     reused when it is there: the bonus and the auxiliary loss of a step see the same advice.
 
     Args:
-        prior (ActionPrior): the good advice.
+        prior (Prior): the good advice.
         p (float): the probability of the adversary at a step, in [0, 1].
-        adversary (ActionPrior, optional): as in :class:`Degradation`.
+        adversary (Prior, optional): as in :class:`Degradation`.
 
     Keyword Args:
         seed (int, optional): seeds a generator of the prior's own, whose state is part of the ``state_dict``. The draws
             are the same on every device. Defaults to ``None``: torch's global generator.
-        generator (torch.Generator, optional): a CPU generator to draw from, instead of ``seed``.
         draw_key (NestedKey, optional): where the draw is kept, bool ``[*B, 1]``. Defaults to
             ``(namespace, "degraded")``. Two degradations of one prior need two keys.
 
     Raises:
-        ValueError: ``p`` is not a probability, both a seed and a generator are given, the generator is not a CPU one,
-            or a degradation inside ``prior`` uses the same ``draw_key``.
+        ValueError: ``p`` is not a probability, or a degradation inside ``prior`` uses the same ``draw_key``.
 
     Examples:
         >>> import torch
@@ -185,26 +177,19 @@ class RandomDegradation(Degradation):
 
     def __init__(
         self,
-        prior: ActionPrior,
+        prior: Prior,
         p: float,
-        adversary: ActionPrior | None = None,
+        adversary: Prior | None = None,
         *,
         seed: int | None = None,
-        generator: torch.Generator | None = None,
         draw_key: NestedKey | None = None,
     ) -> None:
         if not 0 <= p <= 1:
             raise ValueError(f"p must be a probability in [0, 1], got {p}.")
-        if seed is not None and generator is not None:
-            raise ValueError("Pass a seed or a generator, not both.")
-        if generator is not None and generator.device.type != "cpu":
-            raise ValueError(
-                f"Draws come from a CPU generator, to be the same everywhere; got one on {generator.device}."
-            )
         super().__init__(prior, adversary)
         self.p = float(p)
-        self.generator = torch.Generator().manual_seed(seed) if seed is not None else generator
-        self.draw_key = self._key("degraded") if draw_key is None else unravel_key(draw_key)
+        self.generator = None if seed is None else torch.Generator().manual_seed(seed)
+        self.draw_key = unravel_key((self.namespace, "degraded") if draw_key is None else draw_key)
         if self.draw_key in super().draw_keys:
             raise ValueError(
                 f"A degradation inside this one already keeps its draw in {self.draw_key!r}: pass a draw_key."

@@ -1,9 +1,9 @@
 """The maths of soft action priors, as pure functions of tensors.
 
-Every component of the library (transforms, losses, the batched gridworld study) computes with the functions below, and
-with nothing else, so that there is one place to check against the paper (Centa & Preux, "Soft Action Priors: Towards
-Robust Policy Transfer"). All functions work elementwise on tensors of any (broadcastable) shape unless a dimension is
-named, are differentiable, and are safe to trace with :func:`torch.compile`.
+Every transform and loss of the library computes with the functions below, and with nothing else, so that there is one
+place to check against the paper (Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer"). All functions
+work elementwise on tensors of any (broadcastable) shape unless a dimension is named, are differentiable, and are safe
+to trace with :func:`torch.compile`.
 
 Notation: pi is the student, pi0 the prior (teacher), w(s) in [0, 1] the prior weight, B the reward bonus, R the reward.
 """
@@ -16,11 +16,9 @@ from torch import Tensor
 __all__ = [
     "alignment",
     "categorical_cross_entropy",
-    "categorical_entropy",
     "gaussian_cross_entropy",
     "has_next_action",
     "joint",
-    "policy_gradient_loss",
     "prior_bonus",
     "prior_weight_loss",
     "shift_to_next",
@@ -45,16 +43,6 @@ def categorical_cross_entropy(log_probs: Tensor, prior_log_probs: Tensor) -> Ten
     """
     # What the student never does costs nothing, even where the prior rules it out too: 0 log 0 = 0.
     return -(log_probs.exp() * prior_log_probs.masked_fill(log_probs == -torch.inf, 0.0)).sum(-1)
-
-
-def categorical_entropy(log_probs: Tensor) -> Tensor:
-    r"""Entropy of a categorical distribution, :math:`H(\pi) = -\sum_a \pi(a)\log\pi(a)`, from ``[*B, A]`` to ``[*B]``.
-
-    Examples:
-        >>> round(categorical_entropy(torch.full((2,), 0.5).log()).item(), 4)  # log 2
-        0.6931
-    """
-    return categorical_cross_entropy(log_probs, log_probs)
 
 
 def gaussian_cross_entropy(loc: Tensor, scale: Tensor, prior_loc: Tensor, prior_scale: Tensor) -> Tensor:
@@ -167,19 +155,17 @@ def shift_to_next(
     return torch.where(terminated, torch.zeros_like(value), shifted)
 
 
-def prior_bonus(weight: Tensor, log_prob: Tensor, center: Tensor | float = 0.0) -> Tensor:
-    r"""Reward bonus of a weighted prior, :math:`B = \omega(s)\,(\log\pi_0(a|s) + c(s))`.
+def prior_bonus(weight: Tensor, log_prob: Tensor) -> Tensor:
+    r"""Reward bonus of a weighted prior, :math:`B = \omega(s)\,\log\pi_0(a|s)`.
 
     ER and AER take state and action at ``t``, E2R and AE2R at ``t + 1`` (see :func:`shift_to_next`); for the methods
-    without a learned weight :math:`\omega = 1`. The paper's bonus has :math:`c = 0`; centred variants add
-    :math:`c = H(\pi_0)` or :math:`c = H^X(\pi\|\pi_0)`, which makes the bonus zero in the mean under the prior or the
-    student.
+    without a learned weight :math:`\omega = 1`.
 
     Examples:
         >>> prior_bonus(torch.tensor(0.5), torch.tensor(-2.0))
         tensor(-1.)
     """
-    return weight * (log_prob + center)
+    return weight * log_prob
 
 
 def alignment(log_prob: Tensor, cross_entropy: Tensor) -> Tensor:
@@ -229,13 +215,3 @@ def prior_weight_loss(target: Tensor, weight: Tensor, signal: Tensor) -> Tensor:
         tensor(1.)
     """
     return (target - weight * signal).square()
-
-
-def policy_gradient_loss(log_prob: Tensor, advantage: Tensor) -> Tensor:
-    r"""Surrogate whose gradient is the policy gradient, :math:`-\log\pi(a_t|s_t)\,\hat A_t`, for a detached advantage.
-
-    Examples:
-        >>> policy_gradient_loss(torch.tensor(-0.5), torch.tensor(2.0))
-        tensor(1.)
-    """
-    return -log_prob * advantage

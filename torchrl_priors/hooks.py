@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import Compose
 from torchrl.trainers import Trainer, TrainerHookBase
 
-from torchrl_priors.transforms import PriorBonus, PriorLogProb
+from torchrl_priors.transforms import prior_transforms
 
 __all__ = ["PriorShaping"]
 
@@ -16,15 +16,14 @@ __all__ = ["PriorShaping"]
 class PriorShaping(TrainerHookBase):
     """Shapes the reward of every batch of a :class:`~torchrl.trainers.Trainer` by the prior of its loss.
 
-    It runs :class:`PriorLogProb` and :class:`PriorBonus` when a batch arrives, before the advantage is estimated. Both
-    take their networks, method, coefficient and keys from the trainer's loss, so that nothing is said twice, and a
+    It runs :func:`prior_transforms` of the trainer's loss when a batch arrives, before the advantage is estimated: a
     trainer that Hydra builds from a YAML file shares what has to be shared.
 
     Keyword Args:
         boundary, time_dim, traj_key, mask_key: as for :class:`PriorLogProb`.
 
     Raises:
-        TypeError: at registration, the trainer's loss is no :class:`ClipPPOPriorLoss` or :class:`AE2RLoss`.
+        TypeError: at registration, the trainer's loss is none of this library.
         ValueError: at registration, the trainer collects asynchronously: it sees no batch of trajectories.
 
     Examples:
@@ -67,7 +66,6 @@ class PriorShaping(TrainerHookBase):
         """Adds itself to what a trainer does with a new batch."""
         if getattr(trainer, "async_collection", False):
             raise ValueError("PriorShaping needs whole batches of trajectories: use async_collection=False.")
-        loss = trainer.loss_module
-        self.transform = Compose(PriorLogProb.from_loss(loss, **self.kwargs), PriorBonus.from_loss(loss))
+        self.transform = prior_transforms(trainer.loss_module, **self.kwargs)
         trainer.register_op("batch_process", self)
         trainer.register_module(name, self)

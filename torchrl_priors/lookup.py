@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
-__all__ = ["StateTable", "read_state"]
+__all__ = ["StateTable", "by_state"]
 
 
-def read_state(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+def by_state(
+    values: Tensor | nn.Module | TensorDictModuleBase | Callable[..., Tensor],
+    in_keys: Sequence[NestedKey] | None,
+    out_key: NestedKey,
+) -> TensorDictModuleBase:
+    """Values ``[*B, K]`` of each state as a TensorDict module.
+
+    Args:
+        values: a table ``[S, K]`` or ``[*W, S, K]``; a network or function of tensors; or such a module, as it is.
+        in_keys (sequence of NestedKey, optional): of a table ``["state"]``, else ``["observation"]``, if not given.
+        out_key (NestedKey): where a table, a network or a function writes.
+
+    Raises:
+        ValueError: a table that reads several keys.
+    """
+    if isinstance(values, TensorDictModuleBase):
+        return values
+    if not isinstance(values, Tensor):
+        return TensorDictModule(values, in_keys=list(in_keys or ["observation"]), out_keys=[out_key])
+    keys = ["state"] if in_keys is None else list(in_keys)
+    if len(keys) != 1:
+        raise ValueError(f"A table reads one key, the state, got in_keys={keys}.")
+    return StateTable(values, in_key=keys[0], out_key=out_key, feature_dims=1)
+
+
+def _read_state(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """The integer states of a tensordict, ``[*B]``, whether they are stored as ``[*B]`` or ``[*B, 1]``.
 
     Raises:
@@ -84,7 +111,7 @@ class StateTable(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the entries at the states of ``tensordict``."""
-        state = read_state(tensordict, self.in_keys[0])
+        state = _read_state(tensordict, self.in_keys[0])
         return tensordict.set(self.out_keys[0], self.gather(state))
 
     def gather(self, state: Tensor) -> Tensor:

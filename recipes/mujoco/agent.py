@@ -17,10 +17,11 @@ from recipes.common.schedules import applies, make_schedule
 from recipes.mujoco.config import MujocoConfig, method_of, teachers
 from recipes.mujoco.task import Task
 from torchrl_priors import (
-    ActionPrior,
+    AE2RLoss,
     AVECMixin,
     ClipPPOPriorLoss,
     CoeffScheduler,
+    Prior,
     PriorBonus,
     PriorLogProb,
     RandomDegradation,
@@ -41,7 +42,7 @@ class AVECClipPPOPriorLoss(AVECMixin, ClipPPOPriorLoss):
     """The same with a prior."""
 
 
-def make_prior(cfg: MujocoConfig, task: Task) -> ActionPrior:
+def make_prior(cfg: MujocoConfig, task: Task) -> Prior:
     """The teacher, degraded as the configuration says."""
     (prior,) = (task.teachers[str(file)] for file in teachers(cfg))
     if cfg.prior.degrade == "structural":
@@ -89,21 +90,20 @@ class Agent(nn.Module):
         self.actor = make_actor(obs_dim, act_dim, hidden)
         self.critic = make_critic(obs_dim, hidden)
         self.critic.module = nn.Sequential(self.critic.module, ValueOffset())
-        options: dict[str, Any] = {"centering": cfg.centering, "bonus_coeff": cfg.bonus_coeff, "td_error": cfg.td_error}
+        options: dict[str, Any] = {"bonus_coeff": cfg.bonus_coeff, "td_error": cfg.td_error, "functional": False}
         ppo: dict[str, Any] = {
             "clip_epsilon": cfg.ppo.clip_epsilon,
             "entropy_bonus": True,
             "entropy_coeff": cfg.ppo.entropy_coeff,
             "critic_coeff": 1.0,
             "normalize_advantage": True,
-            "functional": False,
             "log_explained_variance": False,
         }
         self.advantage = GAE(gamma=cfg.ppo.gamma, lmbda=cfg.ppo.gae_lambda, value_network=self.critic)
         self.transforms: list[Any] = []
         self.weight, self.raw_critic, self.shares_entropy = None, None, False
         if cfg.method == "none":
-            self.loss: nn.Module = AVECClipPPOLoss(self.actor, self.critic, **ppo)
+            self.loss: nn.Module = AVECClipPPOLoss(self.actor, self.critic, functional=False, **ppo)
             return
         prior = make_prior(cfg, task)
         if spec.adaptive:
@@ -112,32 +112,28 @@ class Agent(nn.Module):
                 options["weight_target"] = "none"
             elif cfg.td_error == "original" and spec.weight_target == "td":
                 self.raw_critic = make_critic(obs_dim, hidden)
-        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True, centering=options["centering"]))
+        self.transforms.append(PriorLogProb(prior, self.actor, keep_params=True))
         if spec.bonus != "none":
-            bonus = PriorBonus.from_method(
-                cfg.method, self.weight, centering=cfg.centering, bonus_coeff=cfg.bonus_coeff
-            )
-            self.transforms.append(bonus)
+            self.transforms.append(PriorBonus.from_method(cfg.method, self.weight, bonus_coeff=cfg.bonus_coeff))
             self.advantage.set_keys(reward="shaped_reward")
         self.shares_entropy = lets_go(cfg) and spec.auxiliary and spec.cross_entropy == "student"
         if self.shares_entropy:
             options["kl_share"] = 0.0
-        self.loss = AVECClipPPOPriorLoss(
+        prior_loss = AE2RLoss(
             self.actor,
-            self.critic,
             prior,
             self.weight,
-            self.raw_critic,
+            self.critic if cfg.td_error == "shaped" else self.raw_critic,
             method=spec,
             aux_coeff=cfg.aux_coeff,
             gamma=cfg.ppo.gamma,
             prior_in_batch=True,
             **options,
-            **ppo,
         )
         if spec.weight_target == "advantage" and spec.bonus == "none":
             # without a bonus PPO's own advantage is one on raw rewards
-            self.loss.set_keys(raw_advantage="advantage")
+            prior_loss.set_keys(raw_advantage="advantage")
+        self.loss = AVECClipPPOPriorLoss(self.actor, self.critic, prior_loss, **ppo)
 
     def networks(self) -> dict[str, nn.Module]:
         """What is trained, by name."""

@@ -123,7 +123,6 @@ class MujocoConfig:
     let_go: LetGo = field(default_factory=LetGo)
     cross_entropy: str | None = one_of("student", "teacher")
     td_error: str = one_of("original", "shaped")
-    centering: str = one_of("none", "prior", "policy")
     bonus_coeff: float = at_least_0()
     aux_coeff: float | None = at_least_0()
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
@@ -165,7 +164,7 @@ def check(cfg: MujocoConfig) -> None:
         ImportError: names the extra that is needed.
     """
     check_keys(cfg)
-    spec = method_of(cfg)
+    method_of(cfg)  # that there is such a method
     files = teachers(cfg)
     if cfg.method == "trial":
         _check_arms(cfg, files)
@@ -175,8 +174,6 @@ def check(cfg: MujocoConfig) -> None:
     if cfg.method == "trial" or cfg.let_go.methods == "all":
         _check_trial(cfg)
     check_schedule(cfg.schedule)
-    if spec.relative:
-        require(cfg.centering == "none", "centering", cfg.centering, f"none, as method={cfg.method} is not centred")
     require(len(cfg.ppo.hidden) > 0 and min(cfg.ppo.hidden) > 0, "ppo.hidden", cfg.ppo.hidden, "positive sizes")
     if cfg.weight.trained == "oracle":
         degrade = cfg.prior.degrade

@@ -11,12 +11,12 @@ from tensordict import TensorDict
 
 from recipes.common.checks import require
 from recipes.mujoco.config import MujocoConfig, check, teachers
-from torchrl_priors import ActionPrior
+from torchrl_priors import Prior
 from torchrl_priors.artifacts import ArtifactError, load_prior
 from torchrl_priors.collectors import make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.networks import make_actor
-from torchrl_priors.objectives import cross_entropy
 
 __all__ = ["Task", "open_task"]
 
@@ -36,7 +36,7 @@ class Task:
     kwargs: dict[str, object]
     obs_dim: int
     act_dim: int
-    teachers: dict[str, ActionPrior]
+    teachers: dict[str, Prior]
 
     def make_env(self, number: int) -> VectorEnv:
         """So many environments."""
@@ -73,14 +73,14 @@ def _sizes(env_id: str, kwargs: dict[str, object]) -> tuple[int, int]:
         raise ValueError(f"env={env_id}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
 
-def _read(cfg: MujocoConfig, path: Path, env_id: str, obs_dim: int, act_dim: int) -> ActionPrior:
+def _read(cfg: MujocoConfig, path: Path, env_id: str, obs_dim: int, act_dim: int) -> Prior:
     """A teacher from its file."""
     if not path.is_file():
         raise FileNotFoundError(
             f"prior.path={path}: {'a folder, expected a file' if path.is_dir() else 'no such file'}."
         )
     try:
-        prior: ActionPrior = load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
+        prior: Prior = load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
     except ArtifactError as error:
         raise ValueError(f"prior.path: {error}") from None
     nothing = torch.zeros(1, obs_dim)

@@ -17,14 +17,14 @@ from torchrl_priors.artifacts.format import pack, read, write_atomically
 from torchrl_priors.artifacts.manifest import PriorManifest, parse_manifest
 from torchrl_priors.artifacts.prior import build_prior, describe_prior
 from torchrl_priors.artifacts.spaces import check_spaces
-from torchrl_priors.priors import ActionPrior
+from torchrl_priors.priors import Prior
 
 __all__ = ["load_prior", "read_manifest", "save_prior"]
 
 
 def save_prior(
     path: str | os.PathLike[str],
-    prior: ActionPrior,
+    prior: Prior,
     *,
     env_id: str,
     seed: int | None = None,
@@ -41,7 +41,7 @@ def save_prior(
 
     Args:
         path (str or path): the file; its folder exists. A file of that name is replaced.
-        prior (ActionPrior): a :class:`ModulePrior`, :class:`BoltzmannPrior`, :class:`AffordancePrior`,
+        prior (Prior): a :class:`ModulePrior`, :class:`BoltzmannPrior`, :class:`AffordancePrior`,
             :class:`UniformPrior` or :class:`MixturePrior`; so are those that :func:`policy_prior`,
             :func:`load_sb3_prior` and :func:`load_prior` give.
 
@@ -70,8 +70,8 @@ def save_prior(
         >>> load_prior(path, env_id="Toy-v0").in_keys
         ['state']
     """
-    if not isinstance(prior, ActionPrior):
-        raise TypeError(f"save_prior writes ActionPriors, got {type(prior).__name__}.")
+    if not isinstance(prior, Prior):
+        raise TypeError(f"save_prior writes priors, got {type(prior).__name__}.")
     parts, tensors = describe_prior(prior)
     told = {"env_id": env_id, "prior": parts, "seed": seed, "frames": frames}
     told |= {"evaluation": dict(evaluation or {}), "training": dict(training or {})}
@@ -95,7 +95,7 @@ def load_prior(
     in_key: NestedKey | None = None,
     namespace: NestedKey = "prior",
     device: torch.device | str | None = None,
-) -> ActionPrior:
+) -> Prior:
     """Reads what :func:`save_prior` wrote. No code in the file can run, and no random number is drawn.
 
     Args:
@@ -155,9 +155,7 @@ def read_manifest(path: str | os.PathLike[str]) -> PriorManifest:
     return _read(Path(path))[0]
 
 
-def _read(
-    path: Path, in_key: NestedKey | None = None, namespace: NestedKey = "prior"
-) -> tuple[PriorManifest, ActionPrior]:
+def _read(path: Path, in_key: NestedKey | None = None, namespace: NestedKey = "prior") -> tuple[PriorManifest, Prior]:
     try:
         tensors, values = read(path)
         manifest = parse_manifest(values)

@@ -26,18 +26,18 @@ from torchrl_priors.artifacts.prior_parts import (
     take_source,
 )
 from torchrl_priors.priors import (
-    ActionPrior,
     AffordancePrior,
     BoltzmannPrior,
     MixturePrior,
     ModulePrior,
+    Prior,
     UniformPrior,
 )
 
 __all__ = ["build_prior", "describe_prior"]
 
 
-def describe_prior(prior: ActionPrior) -> tuple[Parts, dict[str, Tensor]]:
+def describe_prior(prior: Prior) -> tuple[Parts, dict[str, Tensor]]:
     """The parts of a prior, for JSON, and its tensors by name.
 
     Raises:
@@ -50,7 +50,7 @@ def describe_prior(prior: ActionPrior) -> tuple[Parts, dict[str, Tensor]]:
 
 def build_prior(
     parts: Any, tensors: dict[str, Tensor], *, in_key: NestedKey | None = None, namespace: NestedKey = "prior"
-) -> ActionPrior:
+) -> Prior:
     """The prior of a file, from all of its tensors.
 
     Raises:
@@ -85,7 +85,7 @@ def _read_instead(parts: Any, keys: list[list[str]]) -> Any:
 # names of the arguments, to what the class is called with.
 
 
-def _describe(prior: ActionPrior, scope: Scope) -> Parts:
+def _describe(prior: Prior, scope: Scope) -> Parts:
     for name, (kind, describe, _) in _KINDS.items():
         if type(prior) is kind:
             return {"prior": name, **describe(prior, scope)}
@@ -95,7 +95,7 @@ def _describe(prior: ActionPrior, scope: Scope) -> Parts:
     )
 
 
-def _build(parts: Any, scope: Scope, namespace: NestedKey = "prior") -> ActionPrior:
+def _build(parts: Any, scope: Scope, namespace: NestedKey = "prior") -> Prior:
     name = parts.get("prior") if isinstance(parts, dict) else parts
     if not isinstance(name, str) or name not in _KINDS:
         raise ArtifactError(f"its kind of prior is unknown: {short(name)}")
@@ -221,7 +221,7 @@ def _read_mixture(scope: Scope, priors: Any, weights: Any) -> dict[str, Any]:
     }
 
 
-_KINDS: dict[str, tuple[type[ActionPrior], Callable[..., Parts], Callable[..., dict[str, Any]]]] = {
+_KINDS: dict[str, tuple[type[Prior], Callable[..., Parts], Callable[..., dict[str, Any]]]] = {
     "module": (ModulePrior, _describe_module, _read_module),
     "boltzmann": (BoltzmannPrior, _describe_values, _read_values),
     "affordance": (AffordancePrior, _describe_affordances, _read_affordances),

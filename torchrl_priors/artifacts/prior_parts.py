@@ -15,8 +15,8 @@ from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 from torchrl_priors.artifacts.errors import ArtifactError, short
 from torchrl_priors.artifacts.network import build_network, describe_network
 from torchrl_priors.lookup import StateTable
-from torchrl_priors.priors import ActionPrior
-from torchrl_priors.priors.mixture import FixedWeights, distribution_class
+from torchrl_priors.priors import Prior
+from torchrl_priors.priors.mixture import FixedWeights
 
 __all__ = [
     "Parts",
@@ -122,13 +122,13 @@ def take_source(parts: Any, scope: Scope) -> tuple[Tensor | nn.Module, list[Nest
     return source, None if fixed else keys_from_json(parts["in_keys"])
 
 
-def name_distribution(prior: ActionPrior) -> str:
+def name_distribution(prior: Prior) -> str:
     """What a file calls the distribution of a prior.
 
     Raises:
         TypeError: it is not one that a file can hold.
     """
-    kind = distribution_class(prior)
+    kind = prior.distribution_class
     for name, known in _DISTRIBUTIONS.items():
         if kind is known:
             return name

@@ -12,18 +12,19 @@ from torch import distributions as d
 from torchrl.data import Categorical, Composite, OneHot, TensorSpec
 
 from torchrl_priors.artifacts.errors import ArtifactError
-from torchrl_priors.priors.action_prior import _ONE_HOT, ActionPrior, _action_shape
+from torchrl_priors.distributions import TORCHRL_ONE_HOT, action_shape
+from torchrl_priors.priors import Prior
 
 __all__ = ["check_spaces"]
 
 Spec: TypeAlias = TensorSpec | Sequence[int] | int
 
 
-def check_spaces(prior: ActionPrior, observation_spec: Spec, action_spec: Spec | None = None) -> None:
+def check_spaces(prior: Prior, observation_spec: Spec, action_spec: Spec | None = None) -> None:
     """Asks a prior about one observation, and holds its distribution against the actions.
 
     Args:
-        prior (ActionPrior): reads one key at most.
+        prior (Prior): reads one key at most.
         observation_spec (TensorSpec, sequence of int or int): the observations, or the shape of one.
         action_spec (TensorSpec, sequence of int or int, optional): the actions, the shape of one, or their number.
 
@@ -48,8 +49,8 @@ def check_spaces(prior: ActionPrior, observation_spec: Spec, action_spec: Spec |
 
 def _check_actions(dist: Any, spec: Spec) -> None:
     """Holds a distribution against the actions, whose spec may have the batch of several environments in front."""
-    advised: tuple[int, ...] = tuple(_action_shape(dist)[len(dist.batch_shape) :])
-    one_hot = isinstance(dist, _ONE_HOT)
+    advised: tuple[int, ...] = tuple(action_shape(dist)[len(dist.batch_shape) :])
+    one_hot = isinstance(dist, TORCHRL_ONE_HOT)
     number = dist.logits.shape[-1] if type(dist) is d.Categorical else None  # of indices
     if isinstance(spec, int):
         fits = number == spec if number is not None else advised == (spec,)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey
-from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 __all__ = ["RunningNorm"]
@@ -116,16 +114,6 @@ class RunningNorm(nn.Module):
     def _check_shape(self, x: Tensor) -> None:
         if x.shape[x.ndim - len(self.shape) :] != self.shape:
             raise ValueError(f"Expected data of shape [..., {', '.join(map(str, self.shape))}], got {tuple(x.shape)}.")
-
-    def as_module(self, in_key: NestedKey = "observation", out_key: NestedKey = "observation_norm") -> TensorDictModule:
-        """This normaliser (not a copy) as a module that reads and writes keys of a tensordict.
-
-        Examples:
-            >>> from tensordict import TensorDict
-            >>> RunningNorm(3).as_module()(TensorDict({"observation": torch.full((3,), 20.0)}))["observation_norm"]
-            tensor([10., 10., 10.])
-        """
-        return TensorDictModule(self, in_keys=[in_key], out_keys=[out_key])
 
     def extra_repr(self) -> str:
         """What ``repr`` shows."""

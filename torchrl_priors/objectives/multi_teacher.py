@@ -9,15 +9,16 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import unravel_key
+from torch import distributions as d
 from torchrl.objectives import LossModule
 
 from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.priors import ActionPrior
+from torchrl_priors.priors import Prior
 
 from .ae2r import AE2RLoss
 
-__all__ = ["MultiTeacherLoss", "check_namespaces"]
+__all__ = ["MultiTeacherLoss"]
 
 
 class MultiTeacherLoss(LossModule):
@@ -33,7 +34,7 @@ class MultiTeacherLoss(LossModule):
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the student.
-        priors (sequence of ActionPrior): the teachers, each with a ``namespace`` of its own, its name.
+        priors (sequence of Prior): the teachers, each with a ``namespace`` of its own, its name.
         prior_weights (sequence of PriorWeight, optional): one for each; ``None`` for methods without.
         critic_network (TensorDictModule, optional): as in :class:`AE2RLoss`.
 
@@ -41,11 +42,11 @@ class MultiTeacherLoss(LossModule):
         method (str or MethodSpec): as in :class:`AE2RLoss`. Defaults to ``"ae2r"``.
         **kwargs: further keyword arguments of :class:`AE2RLoss`, the same for all teachers.
 
-    The batch must hold what :func:`~torchrl_priors.multi_teacher_transforms` writes. ``set_keys`` renames ``reward``,
+    The batch must hold what :func:`~torchrl_priors.prior_transforms` write for it. ``set_keys`` renames ``reward``,
     ``terminated``, ``value`` and ``raw_advantage`` for all teachers. The output is that of :class:`AE2RLoss`, its names
     followed by the teacher's: ``"loss_prior_expert"``, ``"loss_prior_weight_expert"``, ``"prior_weight_expert"``, ...;
     and, once, ``"loss_prior_critic"`` and ``"prior_td_error"``. Coefficients are those of the :class:`AE2RLoss` of each
-    teacher, in ``losses``: ``loss.losses[0].aux_coeff = 0.5``.
+    teacher, in ``losses``: ``loss.losses[0].aux_coeff = 0.5``. :class:`ClipPPOPriorLoss` takes it as it takes one loss.
 
     Raises:
         ValueError: two teachers share a namespace, there is not one weight for each, or as in :class:`AE2RLoss`.
@@ -70,7 +71,7 @@ class MultiTeacherLoss(LossModule):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        priors: Sequence[ActionPrior],
+        priors: Sequence[Prior],
         prior_weights: Sequence[PriorWeight] | None = None,
         critic_network: TensorDictModule | None = None,
         *,
@@ -78,17 +79,16 @@ class MultiTeacherLoss(LossModule):
         **kwargs: Any,
     ) -> None:
         spec = get_method(method) if isinstance(method, str) else method
-        weights = check_namespaces(priors, prior_weights, adaptive=spec.adaptive)
+        weights = _weight_of_each(priors, prior_weights, adaptive=spec.adaptive)
         super().__init__()
         self.spec = spec
-        self.names = [_flat(prior.namespace) for prior in priors]
         losses: list[AE2RLoss] = []
         for prior, weight in zip(priors, weights, strict=True):
             loss = AE2RLoss(actor_network, prior, weight, critic_network, method=spec, **kwargs)
-            keys = ("prior_log_prob", "prior_center", "prior_bonus")
+            keys = ("prior_log_prob", "prior_bonus")
             loss.set_keys(**{key: unravel_key((prior.namespace, key)) for key in keys})
             if losses:
-                loss._trains_critic = False  # one critic serves all weights, and the first loss trains it
+                loss.trains_critic = False  # one critic serves all weights, and the first loss trains it
                 # one set of parameters, so that a move to another device or dtype keeps them one
                 loss.actor_network_params = losses[0].actor_network_params
                 loss.critic_network_params = losses[0].critic_network_params
@@ -96,8 +96,10 @@ class MultiTeacherLoss(LossModule):
         self.losses = torch.nn.ModuleList(losses)
         self.reduction = losses[0].reduction
 
-    def _by_name(self) -> list[tuple[str, Any]]:
-        return list(zip(self.names, self.losses, strict=True))
+    @property
+    def teachers(self) -> list[AE2RLoss]:
+        """The loss of each teacher."""
+        return list(self.losses)  # type: ignore[arg-type]
 
     def set_keys(self, **kwargs: Any) -> None:
         """Renames an entry for all teachers.
@@ -111,7 +113,7 @@ class MultiTeacherLoss(LossModule):
                 f" {', '.join(self._renamed)}."
             )
         super().set_keys(**kwargs)
-        for _, loss in self._by_name():
+        for loss in self.teachers:
             loss.set_keys(**kwargs)
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
@@ -120,29 +122,33 @@ class MultiTeacherLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """What the losses read from the batch."""
-        return list(dict.fromkeys(key for _, loss in self._by_name() for key in loss.in_keys))
+        return list(dict.fromkeys(key for loss in self.teachers for key in loss.in_keys))
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """What this instance writes."""
-        return list(dict.fromkeys(self._name(key, name) for name, loss in self._by_name() for key in loss.out_keys))
+        return list(dict.fromkeys(self._name(key, loss) for loss in self.teachers for key in loss.out_keys))
 
-    def _name(self, key: str, name: str) -> str:
-        return key if key in self._shared else f"{key}_{name}"
+    def _name(self, key: str, loss: AE2RLoss) -> str:
+        return key if key in self._shared else f"{key}_{_flat(loss.prior.namespace)}"
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch, and what is worth logging; the batch is left as it is."""
+        return self.losses_of(tensordict)
+
+    def losses_of(self, tensordict: TensorDictBase, dist: d.Distribution | None = None) -> TensorDictBase:
+        """See :meth:`forward`; ``dist`` is the student's distribution, if it is at hand."""
         out: dict[str, Any] = {}
-        for name, loss in self._by_name():
+        for loss in self.teachers:
             loss.loss_mask_key, loss.reduction = self.loss_mask_key, self.reduction
-            for key, value in loss(tensordict).items():
-                out.setdefault(self._name(key, name), value)
+            for key, value in loss.losses_of(tensordict, dist).items():
+                out.setdefault(self._name(key, loss), value)
         return TensorDict(out)
 
     def reset_parameters_recursive(self) -> None:
         """Reset the networks that these losses train; never a prior."""
-        for _, loss in self._by_name():
+        for loss in self.teachers:
             loss.reset_parameters_recursive()
 
 
@@ -150,8 +156,8 @@ def _flat(namespace: NestedKey) -> str:
     return "_".join(namespace) if isinstance(namespace, tuple) else namespace
 
 
-def check_namespaces(
-    priors: Sequence[ActionPrior], prior_weights: Sequence[PriorWeight] | None, *, adaptive: bool
+def _weight_of_each(
+    priors: Sequence[Prior], prior_weights: Sequence[PriorWeight] | None, *, adaptive: bool
 ) -> list[PriorWeight | None]:
     """The weight of each teacher, ``None`` for methods without; refuses teachers that would share entries."""
     names = [prior.namespace for prior in priors]

@@ -1,4 +1,4 @@
-"""Soft action priors: one interface, :class:`ActionPrior`, and ready-made teachers."""
+"""Soft action priors: one interface, :class:`Prior`, and ready-made teachers."""
 
 from torchrl_priors.priors.action_prior import ActionPrior
 from torchrl_priors.priors.affordance import AffordancePrior
@@ -7,6 +7,7 @@ from torchrl_priors.priors.callable import CallablePrior
 from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.policy import policy_prior
+from torchrl_priors.priors.prior import Prior
 from torchrl_priors.priors.uniform import UniformPrior
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "CallablePrior",
     "MixturePrior",
     "ModulePrior",
+    "Prior",
     "UniformPrior",
     "policy_prior",
 ]

@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from tensordict import NestedKey
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch import distributions as d
 
-from torchrl_priors.lookup import StateTable
-from torchrl_priors.priors.action_prior import ActionPrior
-from torchrl_priors.priors.smoothing import check_epsilon, smoothed_logits
+from torchrl_priors.lookup import by_state
+from torchrl_priors.priors.action_prior import ActionPrior, policy_of
+from torchrl_priors.priors.spread import check_epsilon, smoothed_logits
 
 __all__ = ["AffordancePrior"]
 
@@ -39,7 +34,7 @@ class AffordancePrior(ActionPrior):
     Keyword Args:
         in_keys (sequence of NestedKey, optional): defaults to ``["state"]`` for a table, else to ``["observation"]``.
         distribution_class (type): over ``logits``. Defaults to :class:`~torch.distributions.Categorical` (indices).
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
         ValueError: ``epsilon`` is out of range, or a weight is negative or not finite.
@@ -65,26 +60,12 @@ class AffordancePrior(ActionPrior):
         namespace: NestedKey = "prior",
     ) -> None:
         smoothing = _Smoothing(check_epsilon(epsilon))
-        source: TensorDictModuleBase
         if isinstance(weights, Tensor):
             smoothing(weights)
-            keys = ["state"] if in_keys is None else list(in_keys)
-            if len(keys) != 1:
-                raise ValueError(f"A table of affordances reads one key, the state, got in_keys={keys}.")
-            source = StateTable(weights, in_key=keys[0], out_key="weights", feature_dims=1)
-        elif isinstance(weights, TensorDictModuleBase):
-            source = weights
-        else:
-            source = TensorDictModule(weights, in_keys=list(in_keys or ["observation"]), out_keys=["weights"])
+        source = by_state(weights, in_keys, "weights")
+        smooth = TensorDictModule(smoothing, in_keys=[source.out_keys[0]], out_keys=["logits"])
         super().__init__(
-            ProbabilisticTensorDictSequential(
-                source,
-                TensorDictModule(smoothing, in_keys=[source.out_keys[0]], out_keys=["logits"]),
-                ProbabilisticTensorDictModule(
-                    in_keys=["logits"], out_keys=["action"], distribution_class=distribution_class
-                ),
-            ),
-            namespace=namespace,
+            policy_of(source, smooth, names=["logits"], distribution_class=distribution_class), namespace=namespace
         )
         self.epsilon = float(epsilon)
 

@@ -6,17 +6,12 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch import distributions as d
 
-from torchrl_priors.lookup import StateTable
-from torchrl_priors.priors.action_prior import ActionPrior
+from torchrl_priors.lookup import by_state
+from torchrl_priors.priors.action_prior import ActionPrior, policy_of
 
 __all__ = ["BoltzmannPrior"]
 
@@ -41,7 +36,7 @@ class BoltzmannPrior(ActionPrior):
             ``"action_value"``, or to its only key.
         distribution_class (type): over ``logits``. Defaults to :class:`~torch.distributions.Categorical` (actions are
             indices ``[*B]``); pass :class:`~torchrl.modules.OneHotCategorical` for one-hot actions ``[*B, A]``.
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
         ValueError: ``temperature`` is not positive and finite, or Q is NaN, +inf, or -inf for all actions of a state.
@@ -69,32 +64,18 @@ class BoltzmannPrior(ActionPrior):
     ) -> None:
         if not 0 < float(temperature) < float("inf"):
             raise ValueError(f"The temperature of a Boltzmann prior must be positive and finite, got {temperature}.")
-        values: TensorDictModuleBase
         if isinstance(q, Tensor):
             _check_action_values(q)
-            keys = ["state"] if in_keys is None else list(in_keys)
-            if len(keys) != 1:
-                raise ValueError(f"A table of action values reads one key, the state, got in_keys={keys}.")
-            values = StateTable(q, in_key=keys[0], out_key="action_value", feature_dims=1)
-        elif isinstance(q, TensorDictModuleBase):
-            values = q
-        else:
-            values = TensorDictModule(q, in_keys=list(in_keys or ["observation"]), out_keys=["action_value"])
+        values = by_state(q, in_keys, "action_value")
         if action_value_key is None:
             action_value_key = "action_value" if len(values.out_keys) != 1 else values.out_keys[0]
         if action_value_key not in values.out_keys:
             raise ValueError(
                 f"{type(q).__name__} writes {values.out_keys}, action values were expected at {action_value_key!r}."
             )
+        softmax = TensorDictModule(_Softmax(temperature), in_keys=[action_value_key], out_keys=["logits"])
         super().__init__(
-            ProbabilisticTensorDictSequential(
-                values,
-                TensorDictModule(_Softmax(temperature), in_keys=[action_value_key], out_keys=["logits"]),
-                ProbabilisticTensorDictModule(
-                    in_keys=["logits"], out_keys=["action"], distribution_class=distribution_class
-                ),
-            ),
-            namespace=namespace,
+            policy_of(values, softmax, names=["logits"], distribution_class=distribution_class), namespace=namespace
         )
 
 

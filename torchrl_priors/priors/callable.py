@@ -7,19 +7,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModuleBase
-from torch import Tensor
+from tensordict import NestedKey
+from torch import Tensor, nn
 from torch import distributions as d
-from torchrl.modules import IndependentNormal
 
-from torchrl_priors.priors.action_prior import ActionPrior
-from torchrl_priors.priors.smoothing import check_epsilon, smoothed_logits
+from torchrl_priors.priors.module import ModulePrior
+from torchrl_priors.priors.spread import as_std, check_epsilon, smoothed_logits
 
 __all__ = ["CallablePrior"]
 
 
-class CallablePrior(ActionPrior):
+class CallablePrior(ModulePrior):
     r"""A Gymnasium-style controller, ``action = policy(observation)`` on NumPy arrays, with a spread around its action.
 
     For scripted controllers and hard-coded bots. It must be a function of the observation alone: rollouts are scored in
@@ -38,7 +36,7 @@ class CallablePrior(ActionPrior):
         in_keys (sequence of NestedKey, optional): defaults to ``["observation"]``. Several are several arguments.
         distribution_class (type, optional): defaults to :class:`~torchrl.modules.IndependentNormal` or
             :class:`~torch.distributions.Categorical` (indices).
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
         ValueError: neither ``std`` nor ``num_actions``, or both, or out of range; at call, the policy's action has
@@ -72,99 +70,57 @@ class CallablePrior(ActionPrior):
     ) -> None:
         if (std is None) == (num_actions is None):
             raise ValueError("Pass std for a controller with continuous actions, or num_actions for discrete ones.")
-        keys: list[NestedKey] = ["observation"] if in_keys is None else list(in_keys)
-        controller: _Controller
-        if std is not None:
-            controller = _Continuous(policy, keys, batched, std)
-        else:
-            controller = _Discrete(policy, keys, batched, num_actions or 0, check_epsilon(epsilon))
-        default = d.Categorical if std is None else IndependentNormal
+        controller = _Controller(policy, batched, num_actions, check_epsilon(epsilon))
         super().__init__(
-            ProbabilisticTensorDictSequential(
-                controller,
-                ProbabilisticTensorDictModule(
-                    in_keys=controller.out_keys,
-                    out_keys=["action"],
-                    distribution_class=default if distribution_class is None else distribution_class,
-                ),
-            ),
+            controller,
+            "mean" if num_actions is None else "logits",
+            std=None if std is None else as_std(std),
+            in_keys=in_keys,
+            distribution_class=distribution_class,
             namespace=namespace,
         )
 
 
-class _Controller(TensorDictModuleBase):
-    """Calls a policy on the observations of a batch."""
+class _Controller(nn.Module):
+    """A policy of arrays as a network of tensors, ``[N, ...]``: its actions, or the logits of discrete ones."""
 
-    def __init__(self, policy: Callable[..., Any], in_keys: list[NestedKey], batched: bool) -> None:
+    def __init__(self, policy: Callable[..., Any], batched: bool, num_actions: int | None, epsilon: float) -> None:
         super().__init__()
         if not callable(policy):
             raise TypeError(f"A CallablePrior needs a function of an observation, got {type(policy).__name__}.")
-        self.policy = policy
-        self.batched = batched
-        self.in_keys = in_keys
-
-    def actions(self, tensordict: TensorDictBase) -> Tensor:
-        """The policy's actions ``[*B, ...]``, on the device of the observations."""
-        batch = tensordict.batch_size
-        tensors = [tensordict.get(key) for key in self.in_keys]
-        arrays = [value.detach().cpu().reshape(-1, *value.shape[len(batch) :]).numpy().copy() for value in tensors]
-        if self.batched:
-            actions = np.asarray(self.policy(*arrays))
-        else:
-            actions = np.stack([np.asarray(self.policy(*single)) for single in zip(*arrays, strict=True)])
-        if actions.shape[:1] != (batch.numel(),):
-            raise ValueError(
-                f"A batched controller gave actions of shape {actions.shape} for {batch.numel()} observations."
-            )
-        return torch.as_tensor(actions, device=tensors[0].device).reshape(*batch, *actions.shape[1:])
-
-
-class _Continuous(_Controller):
-    std: Tensor
-
-    def __init__(
-        self, policy: Callable[..., Any], in_keys: list[NestedKey], batched: bool, std: float | Sequence[float]
-    ) -> None:
-        super().__init__(policy, in_keys, batched)
-        self.out_keys = ["loc", "scale"]
-        self.register_buffer("std", torch.as_tensor(std, dtype=torch.get_default_dtype()))
-        if self.std.ndim > 1 or not ((self.std > 0) & self.std.isfinite()).all():
-            raise ValueError(f"std must be positive and finite, a number or one per dimension, got {std}.")
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        loc = self.actions(tensordict).to(self.std)
-        if loc.ndim != tensordict.ndim + 1 or (self.std.ndim and self.std.shape != loc.shape[-1:]):
-            raise ValueError(
-                "Expected continuous actions of shape [act_dim] from the controller, and std a number or [act_dim],"
-                f" got {tuple(loc.shape[tensordict.ndim :])} and {tuple(self.std.shape)}."
-            )
-        if not loc.isfinite().all():
-            raise ValueError("The controller gave an action that is not finite.")
-        return tensordict.set("loc", loc).set("scale", self.std.expand_as(loc))
-
-
-class _Discrete(_Controller):
-    def __init__(
-        self, policy: Callable[..., Any], in_keys: list[NestedKey], batched: bool, num_actions: int, epsilon: float
-    ) -> None:
-        super().__init__(policy, in_keys, batched)
-        if num_actions < 1:
+        if num_actions is not None and num_actions < 1:
             raise ValueError(f"num_actions must be at least 1, got {num_actions}.")
-        self.out_keys = ["logits"]
-        self.num_actions = num_actions
-        self.epsilon = epsilon
+        self.policy, self.batched, self.num_actions, self.epsilon = policy, batched, num_actions, epsilon
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.actions(tensordict)
-        if action.is_floating_point() or action.shape != tensordict.batch_size:
+    def forward(self, *observations: Tensor) -> Tensor:
+        arrays = [value.detach().cpu().numpy().copy() for value in observations]
+        if self.batched:
+            found = np.asarray(self.policy(*arrays))
+        else:
+            found = np.stack([np.asarray(self.policy(*single)) for single in zip(*arrays, strict=True)])
+        number = len(arrays[0])
+        if found.shape[:1] != (number,):
+            raise ValueError(f"A batched controller gave actions of shape {found.shape} for {number} observations.")
+        action = torch.as_tensor(found, device=observations[0].device)
+        return self._mean(action) if self.num_actions is None else self._logits(action, self.num_actions)
+
+    def _mean(self, action: Tensor) -> Tensor:
+        if action.ndim != 2:
+            shape = tuple(action.shape[1:])
+            raise ValueError(f"Expected continuous actions of shape [act_dim] from the controller, got {shape}.")
+        if not action.isfinite().all():
+            raise ValueError("The controller gave an action that is not finite.")
+        return action.to(torch.get_default_dtype())
+
+    def _logits(self, action: Tensor, number: int) -> Tensor:
+        if action.is_floating_point() or action.ndim != 1:
             raise ValueError(
                 f"Expected an integer for each observation from the controller, got {action.dtype} of shape"
-                f" {tuple(action.shape[tensordict.ndim :])}."
+                f" {tuple(action.shape[1:])}."
             )
-        if ((action < 0) | (action >= self.num_actions)).any():
+        if ((action < 0) | (action >= number)).any():
             raise ValueError(
                 f"The controller gave actions in [{int(action.min())}, {int(action.max())}], and num_actions is"
-                f" {self.num_actions}."
+                f" {number}."
             )
-        chosen = torch.nn.functional.one_hot(action.long(), self.num_actions)
-        return tensordict.set("logits", smoothed_logits(chosen, self.epsilon))
+        return smoothed_logits(nn.functional.one_hot(action.long(), number), self.epsilon)

@@ -90,11 +90,6 @@ class StateIndependentStd(nn.Module):
 
     Args:
         log_std (Tensor): its logarithm, ``[A]``.
-
-    Examples:
-        >>> import torch
-        >>> StateIndependentStd(torch.zeros(2))(torch.tensor([3.0, 4.0]))[1]
-        tensor([1., 1.], grad_fn=<ExpandBackward0>)
     """
 
     def __init__(self, log_std: Tensor) -> None:
@@ -110,17 +105,10 @@ class GaussianHead(nn.Module):
     """Mean and standard deviation ``[*B, A]`` from features ``[*B, F]``, its logarithm clamped.
 
     Args:
-        features (int): F.
-        act_dim (int): A.
+        features, act_dim (int): F and A.
 
     Keyword Args:
         log_std_range (tuple of float): where the logarithm is clamped. Defaults to ``(-20, 2)``, as in SAC.
-
-    Examples:
-        >>> import torch
-        >>> mean, std = GaussianHead(4, 2)(torch.zeros(7, 4))
-        >>> mean.shape, std.shape
-        (torch.Size([7, 2]), torch.Size([7, 2]))
     """
 
     def __init__(self, features: int, act_dim: int, *, log_std_range: tuple[float, float] = (-20.0, 2.0)) -> None:
@@ -140,11 +128,6 @@ class ScaleToBox(nn.Module):
 
     Args:
         low, high (Tensor): the bounds, ``[A]``.
-
-    Examples:
-        >>> import torch
-        >>> ScaleToBox(torch.tensor([0.0]), torch.tensor([4.0]))(torch.tensor([-1.0]))
-        tensor([0.])
     """
 
     low: Tensor
@@ -166,11 +149,6 @@ class NatureCNN(nn.Module):
     Args:
         shape (sequence of int): channels, height and width of an image.
         features (int): what it gives. Defaults to 512.
-
-    Examples:
-        >>> import torch
-        >>> NatureCNN((4, 84, 84))(torch.zeros(2, 3, 4, 84, 84)).shape
-        torch.Size([2, 3, 512])
     """
 
     def __init__(self, shape: Sequence[int], features: int = 512) -> None:

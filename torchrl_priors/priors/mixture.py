@@ -8,18 +8,19 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch import distributions as d
 from torchrl.modules import IndependentNormal, OneHotCategorical
 
-from torchrl_priors.lookup import StateTable
-from torchrl_priors.priors.action_prior import _ONE_HOT, ActionPrior, _action_shape, _distribution_module
+from torchrl_priors.distributions import CATEGORICAL, TORCHRL_ONE_HOT, action_shape, without_independent
+from torchrl_priors.lookup import by_state
+from torchrl_priors.priors.prior import Prior
 
-__all__ = ["MixturePrior"]
+__all__ = ["FixedWeights", "MixturePrior"]
 
 
-class MixturePrior(ActionPrior):
+class MixturePrior(Prior):
     r"""A mixture of priors, :math:`\pi_0(a|s) = \sum_k w_k(s)\,\pi_k(a|s)`.
 
     All are over the same actions. Categorical priors mix to a categorical one, with ``logits``: the cross-entropy stays
@@ -30,7 +31,7 @@ class MixturePrior(ActionPrior):
     state, see :class:`~torchrl_priors.MultiTeacherLoss`.
 
     Args:
-        priors (sequence of ActionPrior): two or more. They are shared.
+        priors (sequence of Prior): two or more. They are shared.
         weights: of the priors, not negative; they are normalised to sum to 1. Defaults to ``None``: equal.
 
             * K numbers: the same in every state;
@@ -41,10 +42,10 @@ class MixturePrior(ActionPrior):
     Keyword Args:
         in_keys (sequence of NestedKey, optional): of ``weights``. Defaults to ``["state"]`` for a table, else to
             ``["observation"]``.
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
-        TypeError: one is no :class:`ActionPrior`.
+        TypeError: one is no :class:`Prior`.
         ValueError: fewer than two; weights that are negative, all 0, or not one for each; two that keep a random draw
             under one key; at call, priors over different actions.
         NotImplementedError: they are neither all categorical nor all Gaussian.
@@ -60,32 +61,29 @@ class MixturePrior(ActionPrior):
 
     def __init__(
         self,
-        priors: Sequence[ActionPrior],
+        priors: Sequence[Prior],
         weights: Sequence[float] | Tensor | nn.Module | TensorDictModuleBase | Callable[..., Tensor] | None = None,
         *,
         in_keys: Sequence[NestedKey] | None = None,
         namespace: NestedKey = "prior",
     ) -> None:
         priors = list(priors)
-        if wrong := [type(prior).__name__ for prior in priors if not isinstance(prior, ActionPrior)]:
-            raise TypeError(f"A mixture is one of ActionPriors, got {', '.join(wrong)}.")
+        if wrong := [type(prior).__name__ for prior in priors if not isinstance(prior, Prior)]:
+            raise TypeError(f"A mixture is one of priors, got {', '.join(wrong)}.")
         if len(priors) < 2:
             raise ValueError(f"A mixture has at least two priors, got {len(priors)}.")
-        super().__init__(priors[0], namespace=namespace)
-        self.distribution_class, self.param_names = _family(priors)
-        self.out_keys = [self._key(name) for name in self.param_names]
-        self.others = nn.ModuleList(priors[1:])
         weights = [1.0] * len(priors) if weights is None else weights
-        self.weights = _weights_module(weights, in_keys, len(priors)).requires_grad_(False)
-        self.in_keys = list(dict.fromkeys(key for part in (*priors, self.weights) for key in part.in_keys))
-        if len(set(self.draw_keys)) < sum(len(prior.draw_keys) for prior in priors):
+        of_state = _weights_module(weights, in_keys, len(priors)).requires_grad_(False).eval()
+        keys = dict.fromkeys(key for part in (*priors, of_state) for key in part.in_keys)
+        distribution_class, names = _family(priors)
+        super().__init__(list(keys), names, distribution_class, namespace=namespace)
+        self.action_key = priors[0].action_key
+        self.priors = nn.ModuleList(priors).eval()
+        self.weights = of_state
+        if len(self.draw_keys) < sum(len(prior.draw_keys) for prior in priors):
             raise ValueError("Two priors of the mixture keep their random draws under one key: pass draw_key to one.")
-        self.train(False)
 
-    @property
-    def priors(self) -> list[ActionPrior]:
-        """The priors that are mixed."""
-        return [self.module, *self.others]
+    priors: Any
 
     @property
     def draw_keys(self) -> list[NestedKey]:
@@ -101,7 +99,7 @@ class MixturePrior(ActionPrior):
     def get_weights(self, tensordict: TensorDictBase) -> Tensor:
         """The weights of the priors, ``[*B, K]``, which sum to 1."""
         out = self.weights(tensordict.select(*self.weights.in_keys)).get(self.weights.out_keys[0])
-        expected = (*tensordict.batch_size, 1 + len(self.others))
+        expected = (*tensordict.batch_size, len(self.priors))
         if tuple(out.shape) != expected:
             raise ValueError(f"The weights of a mixture must be of shape {expected}, got {tuple(out.shape)}.")
         if not torch.compiler.is_compiling():
@@ -113,14 +111,14 @@ class MixturePrior(ActionPrior):
         """The parameters of the mixture by name."""
         dists: list[Any] = [prior.get_dist(tensordict) for prior in self.priors]
         discrete = self.param_names == ["logits"]
-        sizes = [dist.logits.shape[-1] if discrete else _action_shape(dist)[-1] for dist in dists]
+        sizes = [dist.logits.shape[-1] if discrete else action_shape(dist)[-1] for dist in dists]
         if len(set(sizes)) > 1:
             raise ValueError(f"The priors of a mixture must be over the same actions, got some over {sizes}.")
         log_weights = self.get_weights(tensordict).log()
         if discrete:
             log_probs = torch.stack([dist.logits for dist in dists], dim=-1)
             return {"logits": torch.logsumexp(log_probs + log_weights.unsqueeze(-2), dim=-1)}
-        normals = [dist.base_dist if isinstance(dist, d.Independent) else dist for dist in dists]
+        normals: list[Any] = [without_independent(dist) for dist in dists]
         return {
             "mixture_logits": log_weights,
             "loc": torch.stack([normal.loc for normal in normals], dim=-2),
@@ -137,21 +135,12 @@ class MixturePrior(ActionPrior):
         )
 
 
-def distribution_class(prior: ActionPrior) -> Any:
-    """The class of a prior's distribution."""
-    while isinstance(prior, ActionPrior):
-        if isinstance(prior, MixturePrior):
-            return prior.distribution_class
-        prior = prior.module
-    return _distribution_module(prior).distribution_class
-
-
-def _family(priors: list[ActionPrior]) -> tuple[Any, list[str]]:
+def _family(priors: list[Prior]) -> tuple[Any, list[str]]:
     """The class of the mixture, and the names of its parameters."""
-    kinds = [distribution_class(prior) for prior in priors]
+    kinds = [prior.distribution_class for prior in priors]
     names = [kind.__name__ if isinstance(kind, type) else repr(kind) for kind in kinds]
-    if all(isinstance(kind, type) and issubclass(kind, (d.Categorical, d.OneHotCategorical)) for kind in kinds):
-        one_hot = {issubclass(kind, (*_ONE_HOT, d.OneHotCategorical)) for kind in kinds}
+    if all(isinstance(kind, type) and issubclass(kind, CATEGORICAL) for kind in kinds):
+        one_hot = {issubclass(kind, (*TORCHRL_ONE_HOT, d.OneHotCategorical)) for kind in kinds}
         if len(one_hot) > 1:
             raise ValueError(f"Actions of these priors are indices for some, one-hot for others: {', '.join(names)}.")
         return OneHotCategorical if one_hot.pop() else d.Categorical, ["logits"]
@@ -168,17 +157,13 @@ def _weights_module(
     in_keys: Sequence[NestedKey] | None,
     number: int,
 ) -> TensorDictModuleBase:
-    if isinstance(weights, TensorDictModuleBase):
-        return deepcopy(weights)
     if isinstance(weights, nn.Module) or (callable(weights) and not isinstance(weights, Tensor)):
-        return TensorDictModule(deepcopy(weights), in_keys=list(in_keys or ["observation"]), out_keys=["weights"])
+        return by_state(deepcopy(weights), in_keys, "weights")
     table = torch.as_tensor(weights, dtype=torch.get_default_dtype())
     if not table.ndim or table.shape[-1] != number:
         raise ValueError(f"A mixture of {number} priors has a weight for each, got shape {tuple(table.shape)}.")
     _check_weights(table)
-    if table.ndim == 1:
-        return FixedWeights(table)
-    return StateTable(table, in_key="state" if in_keys is None else in_keys[0], out_key="weights", feature_dims=1)
+    return FixedWeights(table) if table.ndim == 1 else by_state(table, in_keys, "weights")
 
 
 def _check_weights(weights: Tensor) -> None:

@@ -5,19 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
-import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch import distributions as d
 from torchrl.modules import IndependentNormal
 
-from torchrl_priors.priors.action_prior import ActionPrior
+from torchrl_priors.distributions import CATEGORICAL, without_independent
+from torchrl_priors.priors.action_prior import ActionPrior, policy_of
+from torchrl_priors.priors.spread import as_std
 
 __all__ = ["ModulePrior"]
 
@@ -27,7 +23,7 @@ _Output = Literal["logits", "probs", "mean", "mean_std", "distribution"]
 class ModulePrior(ActionPrior):
     r"""Any :class:`torch.nn.Module` as a teacher. What it returns is said, not guessed.
 
-    Like any :class:`ActionPrior` it copies the network, freezes it and keeps it in evaluation mode.
+    Like any :class:`ActionPrior` it copies the network and freezes it.
 
     Args:
         module (nn.Module): from the entries ``in_keys`` to ``output``. It gets and returns ``[N, ...]``: the batch is
@@ -50,13 +46,14 @@ class ModulePrior(ActionPrior):
             :class:`~torchrl.modules.OneHotCategorical` for one-hot actions, :class:`~torchrl.modules.TanhNormal` for
             squashed ones.
         distribution_kwargs (dict, optional): its further arguments, e.g. ``low`` and ``high``.
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
         TypeError: ``module`` is no network; at call, it returns something else than ``output``.
         ValueError: an unknown ``output``; a ``std`` that is missing, not positive, or of no use.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> batch = TensorDict(observation=torch.randn(5, 3), action=torch.zeros(5, 2), batch_size=[5])
         >>> ModulePrior(torch.nn.Linear(3, 2), "mean", std=0.5).log_prob(batch).shape
@@ -89,24 +86,14 @@ class ModulePrior(ActionPrior):
                 raise ValueError(
                     "output='distribution' needs distribution_class, which says whether it is categorical or Gaussian."
                 )
-            discrete = issubclass(distribution_class, (d.Categorical, d.OneHotCategorical))
+            discrete = issubclass(distribution_class, CATEGORICAL)
         if distribution_class is None:
             distribution_class = d.Categorical if discrete else IndependentNormal
         names = ["logits"] if discrete else ["loc", "scale"]
+        keys = ["observation"] if in_keys is None else list(in_keys)
+        network = _Flat(_Params(module, output, std, discrete), in_keys=keys, out_keys=names)
         super().__init__(
-            ProbabilisticTensorDictSequential(
-                _Flat(
-                    _Params(module, output, std, discrete),
-                    in_keys=["observation"] if in_keys is None else list(in_keys),
-                    out_keys=names,
-                ),
-                ProbabilisticTensorDictModule(
-                    in_keys=names,
-                    out_keys=["action"],
-                    distribution_class=distribution_class,
-                    distribution_kwargs=distribution_kwargs,
-                ),
-            ),
+            policy_of(network, names=names, distribution_class=distribution_class, **(distribution_kwargs or {})),
             namespace=namespace,
         )
         self.output = output
@@ -137,14 +124,10 @@ class _Params(nn.Module):
                 if std is None
                 else f"std is the spread of a deterministic teacher, output='mean', and of no use for {output!r}."
             )
-        if std is not None:
-            std = torch.as_tensor(std, dtype=torch.get_default_dtype()).detach().clone()
-            if std.ndim > 1 or not ((std > 0) & std.isfinite()).all():
-                raise ValueError(f"std must be positive and finite, a number or one per dimension, got {std.tolist()}.")
         self.network = module
         self.output = output
         self.discrete = discrete
-        self.register_buffer("std", std)
+        self.register_buffer("std", None if std is None else as_std(std))
 
     def forward(self, *inputs: Tensor) -> Tensor | tuple[Tensor, Tensor]:
         value = self.network(*inputs)
@@ -160,14 +143,15 @@ class _Params(nn.Module):
             return value.log()
         if self.output == "mean":
             assert self.std is not None
+            if self.std.ndim and self.std.shape != value.shape[-1:]:
+                shapes = f"{tuple(value.shape[1:])} and {tuple(self.std.shape)}"
+                raise ValueError(f"std must be a number or one per dimension of the action, got {shapes}.")
             return value, self.std.to(value.dtype).expand_as(value)
         return value
 
     def _of_distribution(self, dist: Any) -> Tensor | tuple[Tensor, Tensor]:
-        base = dist
-        while isinstance(base, d.Independent):
-            base = base.base_dist
-        if self.discrete and isinstance(base, (d.Categorical, d.OneHotCategorical)):
+        base = without_independent(dist)
+        if self.discrete and isinstance(base, CATEGORICAL):
             return base.logits
         if not self.discrete and isinstance(base, d.Normal):
             return base.loc, base.scale

@@ -6,15 +6,17 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch import distributions as d
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 from torchrl.modules import OneHotCategorical
 
-from torchrl_priors.priors.action_prior import ActionPrior
+from torchrl_priors.distributions import BoxUniform
+from torchrl_priors.priors.action_prior import ActionPrior, policy_of
+from torchrl_priors.priors.prior import Prior
 
-__all__ = ["BoxUniform", "UniformPrior"]
+__all__ = ["UniformPrior"]
 
 
 class UniformPrior(ActionPrior):
@@ -29,7 +31,7 @@ class UniformPrior(ActionPrior):
             continuous; or a number of discrete actions, given by their indices.
 
     Keyword Args:
-        namespace (str or tuple of str): as in :class:`ActionPrior`.
+        namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
         ValueError: a number of actions below 1, or a spec without a uniform distribution (unbounded).
@@ -48,21 +50,10 @@ class UniformPrior(ActionPrior):
 
     def __init__(self, actions: TensorSpec | int, *, namespace: NestedKey = "prior") -> None:
         params, distribution_class, kwargs = _uniform(actions)
-        names = list(params)
-        super().__init__(
-            ProbabilisticTensorDictSequential(
-                _Constant(params),
-                ProbabilisticTensorDictModule(
-                    in_keys=names,
-                    out_keys=["action"],
-                    distribution_class=distribution_class,
-                    distribution_kwargs=kwargs,
-                ),
-            ),
-            namespace=namespace,
-        )
+        policy = policy_of(_Constant(params), names=list(params), distribution_class=distribution_class, **kwargs)
+        super().__init__(policy, namespace=namespace)
 
-    def adversary(self) -> ActionPrior:
+    def adversary(self) -> Prior:
         """The prior itself: no advice has no opposite."""
         return self
 
@@ -82,24 +73,6 @@ class _Constant(TensorDictModuleBase):
             value = getattr(self, name)
             tensordict.set(name, value.to(tensordict.device).expand(*tensordict.batch_size, *value.shape))
         return tensordict
-
-
-class BoxUniform(d.Independent):
-    """Uniform over a box; an action outside, which the environment clips, is scored as the bound it is clipped to."""
-
-    def __init__(self, low: Tensor, high: Tensor, event_dims: int) -> None:
-        super().__init__(d.Uniform(low, high, validate_args=False), event_dims)
-
-    @property
-    def log_density(self) -> Tensor:
-        """Minus the log of the box's volume, ``[*B]``."""
-        density, dims = -(self.base_dist.high - self.base_dist.low).log(), self.reinterpreted_batch_ndims
-        return density.flatten(-dims).sum(-1) if dims else density
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """The same for every action."""
-        shape = value.shape[: value.ndim - len(self.event_shape)]
-        return self.log_density.to(value.dtype).expand(torch.broadcast_shapes(shape, self.batch_shape))
 
 
 def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[str, Any]]:

@@ -5,22 +5,10 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any, NoReturn
 
-from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, Transform
-from torchrl.objectives import LossModule
 
-from torchrl_priors.objectives import AE2RLoss
-
-__all__ = ["BatchTransform", "prior_loss_of"]
-
-
-def prior_loss_of(loss: LossModule) -> AE2RLoss:
-    """The loss itself, or the one of the prior in a loss of both."""
-    inner = getattr(loss, "prior_loss", loss)
-    if not isinstance(inner, AE2RLoss):
-        raise TypeError(f"Expected an AE2RLoss or a ClipPPOPriorLoss, got {type(loss).__name__}.")
-    return inner
+__all__ = ["BatchTransform"]
 
 
 class BatchTransform(Transform):
@@ -60,9 +48,3 @@ class BatchTransform(Transform):
         if self.parent is not None:
             self._refuse()
         return self.forward(next_tensordict)
-
-    def _get(self, tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(f"{type(self).__name__} reads {key!r}, which is not in the batch. {hint}".rstrip())
-        return value

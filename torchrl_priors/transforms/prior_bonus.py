@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from torchrl_priors.functional import prior_bonus
+from torchrl_priors.keys import check_option, read, under_next
 from torchrl_priors.methods import get_method
-from torchrl_priors.objectives.batch import under_next
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of
+from torchrl_priors.transforms.batch_transform import BatchTransform
 
 __all__ = ["PriorBonus"]
-
-_Shift = Literal["none", "current", "next"]
-_Centering = Literal["none", "prior", "policy"]
 
 
 class PriorBonus(BatchTransform):
@@ -38,15 +34,12 @@ class PriorBonus(BatchTransform):
         shift ("next", "current" or "none"): the step whose advice is rewarded; ``"none"`` is no bonus, for the methods
             that have an auxiliary loss only. Defaults to ``"next"``.
         relative (bool): subtracts the student's log-probability, :math:`B_t = \omega(s)(\log\pi_0(a|s)-\log\pi(a|s))`:
-            the penalty of KL-regularised RL, in the mean :math:`-\mathrm{KL}(\pi\|\pi_0)`. Of ``shift="current"`` only,
-            and not centred. Defaults to ``False``.
+            the penalty of KL-regularised RL, in the mean :math:`-\mathrm{KL}(\pi\|\pi_0)`. Of ``shift="current"`` only.
+            Defaults to ``False``.
         bonus_coeff (float): :math:`c`, kept as a buffer. Defaults to 1.
-        centering ("none", "prior" or "policy"): adds the center that :class:`PriorLogProb` wrote with the same setting,
-            :math:`B_t = \omega(s)(\log\pi_0(a|s) + c(s))`. Defaults to ``"none"``.
         reward_key (NestedKey): ``[*B, T, 1]``, read under ``"next"``. Defaults to ``"reward"``.
         terminated_key (NestedKey): bool, ``[*B, T, 1]``, read under ``"next"``. Defaults to ``"terminated"``.
-        log_prob_key, center_key (NestedKey): what :class:`PriorLogProb` wrote, ``[*B, T, 1]``. Defaults to
-            ``"prior_log_prob"`` and ``"prior_center"``.
+        log_prob_key (NestedKey): what :class:`PriorLogProb` wrote, ``[*B, T, 1]``. Defaults to ``"prior_log_prob"``.
         student_log_prob_key (NestedKey): :math:`\log\pi(a|s)` of the policy that collected the batch, ``[*B, T]`` or
             ``[*B, T, 1]``, read if ``relative``. Defaults to ``"action_log_prob"``.
         out_keys (list of NestedKey, optional): the bonus (without :math:`c`) and the shaped reward, ``[*B, T, 1]``.
@@ -79,24 +72,18 @@ class PriorBonus(BatchTransform):
         self,
         prior_weight: PriorWeight | None = None,
         *,
-        shift: _Shift = "next",
+        shift: Literal["none", "current", "next"] = "next",
         relative: bool = False,
         bonus_coeff: float = 1.0,
-        centering: _Centering = "none",
         reward_key: NestedKey = "reward",
         terminated_key: NestedKey = "terminated",
         log_prob_key: NestedKey = "prior_log_prob",
-        center_key: NestedKey = "prior_center",
         student_log_prob_key: NestedKey = "action_log_prob",
         out_keys: list[NestedKey] | None = None,
     ) -> None:
-        for name, value, known in (("shift", shift, _Shift), ("centering", centering, _Centering)):
-            if value not in get_args(known):
-                raise ValueError(f"Unknown {name} {value!r}: expected one of {', '.join(get_args(known))}.")
-        if relative and (shift != "current" or centering != "none"):
-            raise ValueError(
-                f"relative=True needs shift='current' and centering='none', got {shift!r} and {centering!r}."
-            )
+        check_option("shift", shift, ("none", "current", "next"))
+        if relative and shift != "current":
+            raise ValueError(f"relative=True needs shift='current', got {shift!r}.")
         if prior_weight is not None and not hasattr(prior_weight, "out_keys"):
             raise TypeError(
                 f"The weight must be a PriorWeight, got {type(prior_weight).__name__}: try PriorWeight(net)."
@@ -112,9 +99,7 @@ class PriorBonus(BatchTransform):
         self.__dict__["prior_weight"] = prior_weight
         self.shift = shift
         self.relative = relative
-        self.centering = centering
-        at = under_next if shift == "next" else unravel_key
-        self.log_prob_key, self.center_key = at(log_prob_key), at(center_key)
+        self.log_prob_key = under_next(log_prob_key) if shift == "next" else unravel_key(log_prob_key)
         self.student_log_prob_key = unravel_key(student_log_prob_key)
         self.register_buffer("bonus_coeff", torch.tensor(float(bonus_coeff)))
 
@@ -139,48 +124,10 @@ class PriorBonus(BatchTransform):
             raise ValueError(f"The method {method!r} has a learned weight: pass prior_weight.")
         return cls(prior_weight if spec.adaptive else None, shift=spec.bonus, relative=spec.relative, **kwargs)
 
-    @classmethod
-    def from_loss(cls, loss: LossModule, **kwargs: Any) -> PriorBonus:
-        """The bonus that belongs to a loss: with its weight, its method, its coefficient and its keys.
-
-        Args:
-            loss (AE2RLoss or ClipPPOPriorLoss): as it is now; later changes of its coefficients or keys are not seen:
-                where a schedule changes the loss's ``bonus_coeff``, give the transform's a scheduler of its own.
-            **kwargs: further keyword arguments of the class, or others than the loss's.
-
-        Raises:
-            TypeError: a loss of another kind.
-
-        Examples:
-            >>> from torchrl_priors import AE2RLoss, UniformPrior
-            >>> actor = UniformPrior(2).module  # any policy
-            >>> PriorBonus.from_loss(AE2RLoss(actor, UniformPrior(2), method="e2r", bonus_coeff=0.5)).bonus_coeff
-            tensor(0.5000)
-        """
-        inner = prior_loss_of(loss)
-        keys = inner.tensor_keys
-        shaped = getattr(loss.tensor_keys, "raw_reward", None) and loss.tensor_keys.reward
-        if shaped is None or shaped == keys.reward:  # the loss does not say, or has no bonus
-            shaped = "shaped_reward"
-        settings: dict[str, Any] = {
-            "shift": inner.spec.bonus,
-            "relative": inner.spec.relative,
-            "bonus_coeff": inner.bonus_coeff.item(),
-            "centering": inner.centering,
-            "reward_key": keys.reward,
-            "terminated_key": keys.terminated,
-            "log_prob_key": keys.prior_log_prob,
-            "center_key": keys.prior_center,
-            "out_keys": [under_next(keys.prior_bonus), under_next(shaped)],
-        }
-        if hasattr(loss.tensor_keys, "sample_log_prob"):
-            settings["student_log_prob_key"] = loss.tensor_keys.sample_log_prob
-        return cls(inner.prior_weight if inner.spec.adaptive else None, **{**settings, **kwargs})
-
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the bonus and the shaped reward into the batch and returns it."""
-        reward = self._get(tensordict, self.reward_key)
+        reward = read(tensordict, self.reward_key, "PriorBonus adds to it")
         bonus = torch.zeros_like(reward) if self.shift == "none" else self._bonus(tensordict)
         if bonus.shape != reward.shape:
             raise ValueError(
@@ -190,24 +137,18 @@ class PriorBonus(BatchTransform):
         return tensordict.set(self.out_keys[1], reward + self.bonus_coeff * bonus)
 
     def _bonus(self, tensordict: TensorDictBase) -> Tensor:
-        hint = "Run PriorLogProb first."
-        log_prob = self._get(tensordict, self.log_prob_key, hint)
-        center: Tensor | float = 0.0
-        if self.centering != "none":
-            center = self._get(
-                tensordict, self.center_key, f"Run PriorLogProb with centering={self.centering!r} first."
-            )
+        log_prob = read(tensordict, self.log_prob_key, "run PriorLogProb on it before PriorBonus")
         if self.relative:
-            student = self._get(tensordict, self.student_log_prob_key, "The policy must return its log-probabilities.")
-            log_prob = log_prob - student.reshape(log_prob.shape)
-        weight: Tensor | float = 1.0
+            hint = "the policy must return its log-probabilities"
+            log_prob = log_prob - read(tensordict, self.student_log_prob_key, hint).reshape(log_prob.shape)
+        weight = torch.ones_like(log_prob)
         module: PriorWeight | None = self.__dict__["prior_weight"]
         if module is not None:
             at = tensordict.get("next") if self.shift == "next" else tensordict
             # a weight of its own tensordict: the one of a loss is evaluated anew, with a gradient
             weight = module(at.select(*module.in_keys)).get(module.out_keys[0])
-        bonus = prior_bonus(weight, log_prob, center)  # type: ignore[arg-type]
+        bonus = prior_bonus(weight, log_prob)
         if self.shift == "next":
-            terminated = self._get(tensordict, self.terminated_key)
+            terminated = read(tensordict, self.terminated_key, "there is no bonus after an end")
             bonus = torch.where(terminated, torch.zeros_like(bonus), bonus)
         return bonus

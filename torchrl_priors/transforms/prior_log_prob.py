@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
-from torch import distributions as d
-from torchrl.objectives import LossModule
 
+from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
-from torchrl_priors.objectives.batch import under_next
-from torchrl_priors.objectives.cross_entropy import cross_entropy
-from torchrl_priors.priors import ActionPrior
-from torchrl_priors.transforms.batch_transform import BatchTransform, prior_loss_of
+from torchrl_priors.keys import check_option, read, under_next
+from torchrl_priors.priors import Prior
+from torchrl_priors.transforms.batch_transform import BatchTransform
 
 __all__ = ["PriorLogProb"]
-
-_Boundary = Literal["expected", "sample", "zero"]
-_Centering = Literal["none", "prior", "policy"]
 
 
 class PriorLogProb(BatchTransform):
@@ -37,11 +32,11 @@ class PriorLogProb(BatchTransform):
     3. elsewhere, where no next action was sampled, what ``boundary`` says of the next state.
 
     Args:
-        prior (ActionPrior): the prior; it also says where the action is (:meth:`ActionPrior.set_keys`). What it draws
-            at random is left in the batch, for the step and for the next one.
-        actor (ProbabilisticTensorDictSequential, optional): the student :math:`\pi`, for ``boundary`` and
-            ``centering``. It is used as it is when a batch arrives, and is no submodule of the transform: moving or
-            saving the transform leaves it alone.
+        prior (Prior): the prior; it also says where the action is (:meth:`Prior.set_keys`). What it draws at random is
+            left in the batch, for the step and for the next one.
+        actor (ProbabilisticTensorDictSequential, optional): the student :math:`\pi`, for ``boundary``. It is used as it
+            is when a batch arrives, and is no submodule of the transform: moving or saving the transform leaves it
+            alone.
 
     Keyword Args:
         time_dim (int, optional): the batch dimension along which time runs. Defaults to ``None``: the one named
@@ -49,14 +44,12 @@ class PriorLogProb(BatchTransform):
         boundary ("expected", "sample" or "zero"): ``"expected"`` (default) is :math:`-H^X_{s'}(\pi\|\pi_0)`, the mean
             over the student's next action, in closed form where there is one; ``"sample"`` is the log-probability of an
             action drawn from the student; ``"zero"`` is no advice.
-        centering ("none", "prior" or "policy"): what else is written, to centre the bonus: :math:`H(\pi_0)`, or
-            :math:`H^X(\pi\|\pi_0)`, of each state and of the next one, by the same rules. Defaults to ``"none"``.
         keep_params (bool): also leave the parameters of the prior's distribution at each step in the batch, under
             ``prior.out_keys``, e.g. ``("prior", "loc")``: losses with ``prior_in_batch=True`` need not run the prior
             again. They are right as long as the observations in the batch are not changed. Defaults to ``False``.
         num_samples (int, optional): for a cross-entropy without a closed form. Defaults to ``None``: 1.
-        out_keys (list of NestedKey, optional): defaults to ``["prior_log_prob"]``, with centring
-            ``["prior_log_prob", "prior_center"]``; each is written ``[*B, T, 1]`` in nats, and under ``"next"`` too.
+        out_keys (list of NestedKey, optional): one, written ``[*B, T, 1]`` in nats, and under ``"next"`` too. Defaults
+            to ``["prior_log_prob"]``.
         done_key, terminated_key (NestedKey): bool, ``[*B, T, 1]``, read under ``"next"``. Defaults to ``"done"`` and
             ``"terminated"``.
         traj_key (NestedKey): trajectory ids ``[*B, T]``, used if they are there. Defaults to
@@ -65,7 +58,7 @@ class PriorLogProb(BatchTransform):
             Defaults to ``("collector", "mask")``.
 
     Raises:
-        ValueError: ``boundary`` or ``centering`` needs an actor; the batch has no time dimension; the prior is over
+        ValueError: ``boundary`` needs an actor; the batch has no time dimension; the prior is over
             other actions; the transform is put into an environment.
         KeyError: an entry is missing in the batch.
 
@@ -94,12 +87,11 @@ class PriorLogProb(BatchTransform):
 
     def __init__(
         self,
-        prior: ActionPrior,
+        prior: Prior,
         actor: TensorDictModuleBase | None = None,
         *,
         time_dim: int | None = None,
-        boundary: _Boundary = "expected",
-        centering: _Centering = "none",
+        boundary: Literal["expected", "sample", "zero"] = "expected",
         keep_params: bool = False,
         num_samples: int | None = None,
         out_keys: list[NestedKey] | None = None,
@@ -108,62 +100,25 @@ class PriorLogProb(BatchTransform):
         traj_key: NestedKey = ("collector", "traj_ids"),
         mask_key: NestedKey = ("collector", "mask"),
     ) -> None:
-        if not isinstance(prior, ActionPrior):
-            raise TypeError(f"The prior must be an ActionPrior, got {type(prior).__name__}: try ActionPrior(policy).")
-        for name, value, known in (("boundary", boundary, _Boundary), ("centering", centering, _Centering)):
-            if value not in get_args(known):
-                raise ValueError(f"Unknown {name} {value!r}: expected one of {', '.join(get_args(known))}.")
-        if actor is None and (boundary != "zero" or centering == "policy"):
-            raise ValueError(
-                f"boundary={boundary!r} with centering={centering!r} needs the student: pass actor, or boundary='zero'"
-                " and no centering by the policy."
-            )
-        if out_keys is None:
-            out_keys = ["prior_log_prob"] if centering == "none" else ["prior_log_prob", "prior_center"]
-        if len(out_keys) != (1 if centering == "none" else 2):
-            raise ValueError(f"Expected one key for the log-probability and one for a center, got {out_keys}.")
+        if not isinstance(prior, Prior):
+            raise TypeError(f"The prior must be a Prior, got {type(prior).__name__}: try ActionPrior(policy).")
+        check_option("boundary", boundary, ("expected", "sample", "zero"))
+        if actor is None and boundary != "zero":
+            raise ValueError(f"boundary={boundary!r} needs the student: pass actor, or boundary='zero'.")
+        out_keys = ["prior_log_prob"] if out_keys is None else out_keys
+        if len(out_keys) != 1:
+            raise ValueError(f"Expected one key for the log-probability, got {out_keys}.")
         super().__init__(in_keys=[*prior.in_keys, prior.action_key], out_keys=out_keys)
         self.prior = prior
         self.__dict__["actor"] = actor
         self.time_dim = time_dim
         self.boundary = boundary
-        self.centering = centering
         self.keep_params = keep_params
         self.num_samples = num_samples
         self.done_key = under_next(done_key)
         self.terminated_key = under_next(terminated_key)
         self.traj_key = unravel_key(traj_key)
         self.mask_key = unravel_key(mask_key)
-
-    @classmethod
-    def from_loss(cls, loss: LossModule, **kwargs: Any) -> PriorLogProb:
-        """The log-probabilities that a loss reads: with its prior, its student, its centering and its keys.
-
-        Args:
-            loss (AE2RLoss or ClipPPOPriorLoss): as it is now; later changes of its keys are not seen.
-            **kwargs: further keyword arguments of the class, or others than the loss's.
-
-        Raises:
-            TypeError: a loss of another kind.
-
-        Examples:
-            >>> from torchrl_priors import AE2RLoss, UniformPrior
-            >>> loss = AE2RLoss(UniformPrior(2).module, UniformPrior(2), method="e2r", centering="prior")
-            >>> PriorLogProb.from_loss(loss, time_dim=1).out_keys
-            ['prior_log_prob', 'prior_center']
-        """
-        inner = prior_loss_of(loss)
-        keys = inner.tensor_keys
-        settings: dict[str, Any] = {
-            "centering": inner.centering,
-            "keep_params": inner.prior_in_batch,
-            "num_samples": inner.num_samples,
-            "done_key": getattr(loss.tensor_keys, "done", "done"),
-            "terminated_key": keys.terminated,
-        }
-        settings.update(kwargs)
-        names = [keys.prior_log_prob] + ([] if settings["centering"] == "none" else [keys.prior_center])
-        return cls(inner.prior, inner.actor_network, **{"out_keys": names, **settings})
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -177,29 +132,23 @@ class PriorLogProb(BatchTransform):
         if self.keep_params:
             for key, name in zip(self.prior.out_keys, self.prior.param_names, strict=True):
                 tensordict.set(key, params[name])
-        values = [self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)]
-        if not torch.compiler.is_compiling() and not values[0].isfinite().all():
+        value = self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)
+        if not torch.compiler.is_compiling() and not value.isfinite().all():
             raise ValueError(
                 "The prior gives a log-probability that is not finite to an action that the student took: smooth it, or"
                 " keep the student's actions within its bounds."
             )
-        if self.centering != "none":
-            policy = self._student(tensordict) if self.centering == "policy" else None
-            values.append(self._center(dist, policy, tensordict.ndim))
 
-        at_boundary = [torch.zeros_like(value) for value in values]
+        at_boundary = torch.zeros_like(value)
         # only the time steps at which some trajectory was cut
         steps = wanted.movedim(time_dim, 0).flatten(1).any(-1).nonzero().squeeze(-1)
         if self.boundary != "zero" and len(steps):
             following = tensordict.get("next")[(slice(None),) * time_dim + (steps,)]
-            for full, part in zip(at_boundary, self._evaluate_boundary(following), strict=True):
-                full.index_copy_(time_dim, steps, part.to(full.dtype))
+            at_boundary.index_copy_(time_dim, steps, self._evaluate_boundary(following).to(value.dtype))
 
-        for key, value, boundary_value in zip(self.out_keys, values, at_boundary, strict=True):
-            tensordict.set(key, value)
-            shifted = shift_to_next(value, boundary_value, has_next, terminated, time_dim=time_dim)
-            tensordict.set(under_next(key), shifted)
-        return tensordict
+        (key,) = self.out_keys
+        shifted = shift_to_next(value, at_boundary, has_next, terminated, time_dim=time_dim)
+        return tensordict.set(key, value).set(under_next(key), shifted)
 
     def _find_time_dim(self, tensordict: TensorDictBase) -> int:
         """The time dimension, given or named: one that is guessed wrong would shift over the batch."""
@@ -218,7 +167,8 @@ class PriorLogProb(BatchTransform):
 
     def _boundaries(self, tensordict: TensorDictBase, time_dim: int) -> tuple[Tensor, Tensor, Tensor]:
         """Where an episode terminates, where a step has a next action, and where the boundary's value is wanted."""
-        terminated, done = self._get(tensordict, self.terminated_key), self._get(tensordict, self.done_key)
+        hint = "PriorLogProb reads where trajectories end"
+        terminated, done = (read(tensordict, key, hint) for key in (self.terminated_key, self.done_key))
         expected = (*tensordict.batch_size, 1)
         for key, flag in ((self.terminated_key, terminated), (self.done_key, done)):
             if flag.shape != expected:
@@ -245,23 +195,12 @@ class PriorLogProb(BatchTransform):
             )
             tensordict.set(under_next(key), draw)
 
-    def _evaluate_boundary(self, following: TensorDictBase) -> list[Tensor]:
-        """The values of next states whose action was not sampled, ``[*B, steps, 1]``."""
-        prior_dist, policy = self.prior.get_dist(following), self._student(following)
+    def _evaluate_boundary(self, following: TensorDictBase) -> Tensor:
+        """What next states whose action was not sampled are worth, ``[*B, steps, 1]``."""
+        actor: TensorDictModuleBase = self.__dict__["actor"]
+        prior_dist, policy = self.prior.get_dist(following), actor.get_dist(following.copy())  # it writes its own
         if self.boundary == "expected":
             log_prob = -cross_entropy(policy, prior_dist, num_samples=self.num_samples)
         else:
             log_prob = prior_dist.log_prob(policy.sample())
-        values = [joint(log_prob, following.ndim)]
-        if self.centering != "none":
-            values.append(self._center(prior_dist, policy, following.ndim))
-        return values
-
-    def _student(self, tensordict: TensorDictBase) -> d.Distribution:
-        actor: TensorDictModuleBase = self.__dict__["actor"]
-        return actor.get_dist(tensordict.copy())  # an actor writes its parameters
-
-    def _center(self, prior_dist: d.Distribution, policy: d.Distribution | None, ndim: int) -> Tensor:
-        """H(pi0) or H^X(pi || pi0), ``[*B, 1]``."""
-        of = prior_dist if self.centering == "prior" or policy is None else policy
-        return joint(cross_entropy(of, prior_dist, num_samples=self.num_samples), ndim)
+        return joint(log_prob, following.ndim)

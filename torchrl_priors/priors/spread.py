@@ -1,11 +1,13 @@
-"""Weights of discrete actions as log-probabilities that are finite."""
+"""What a teacher that names one action leaves to the others, so that its log-probabilities are finite."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-__all__ = ["check_epsilon", "smoothed_logits"]
+__all__ = ["as_std", "check_epsilon", "smoothed_logits"]
 
 
 def smoothed_logits(weights: Tensor, epsilon: float) -> Tensor:
@@ -37,3 +39,11 @@ def check_epsilon(epsilon: float) -> float:
     if not 0 < epsilon <= 1:
         raise ValueError(f"epsilon is the probability of any action at random, in (0, 1], got {epsilon}.")
     return float(epsilon)
+
+
+def as_std(std: float | Sequence[float] | Tensor) -> Tensor:
+    """The spread around a continuous action as a tensor of its own, refused if it is not positive and finite."""
+    value = torch.as_tensor(std, dtype=torch.get_default_dtype()).detach().clone()
+    if value.ndim > 1 or not ((value > 0) & value.isfinite()).all():
+        raise ValueError(f"std must be positive and finite, a number or one per dimension, got {value.tolist()}.")
+    return value

@@ -1,21 +1,66 @@
-"""The auxiliary loss of a soft action prior: the cross-entropy from the student's distribution to the prior's."""
+"""What is known of pairs of distributions: cross-entropies, divergences, closed forms, and whether supports match."""
 
 from __future__ import annotations
 
 from typing import Any, TypeGuard
 
 import torch
+from tensordict.nn.distributions import OneHotCategorical as TensorDictOneHotCategorical
 from torch import Tensor
 from torch import distributions as d
-from torchrl.modules import TanhNormal
+from torchrl.modules import MaskedOneHotCategorical, OneHotCategorical, OneHotOrdinal, TanhNormal
 from torchrl.modules.distributions.utils import has_analytic_entropy, has_analytic_kl, rsample_and_log_prob
 
 from torchrl_priors.functional import categorical_cross_entropy, gaussian_cross_entropy
-from torchrl_priors.priors.uniform import BoxUniform
 
-__all__ = ["cross_entropy", "has_analytic_cross_entropy", "kl_divergence"]
+__all__ = [
+    "CATEGORICAL",
+    "TORCHRL_ONE_HOT",
+    "BoxUniform",
+    "action_shape",
+    "cross_entropy",
+    "cross_entropy_and_kl",
+    "cross_entropy_of_advice",
+    "kl_divergence",
+    "without_independent",
+]
 
-_CATEGORICAL = (d.Categorical, d.OneHotCategorical)
+#: Distributions over discrete actions, given by their indices or one-hot.
+CATEGORICAL = (d.Categorical, d.OneHotCategorical)
+#: Those of TorchRL over one-hot actions, which are categorical ones to torch.
+TORCHRL_ONE_HOT = (OneHotCategorical, MaskedOneHotCategorical, OneHotOrdinal, TensorDictOneHotCategorical)
+
+
+class BoxUniform(d.Independent):
+    """Uniform over a box; an action outside, which the environment clips, is scored as the bound it is clipped to."""
+
+    def __init__(self, low: Tensor, high: Tensor, event_dims: int) -> None:
+        super().__init__(d.Uniform(low, high, validate_args=False), event_dims)
+
+    @property
+    def log_density(self) -> Tensor:
+        """Minus the log of the box's volume, ``[*B]``."""
+        density, dims = -(self.base_dist.high - self.base_dist.low).log(), self.reinterpreted_batch_ndims
+        return density.flatten(-dims).sum(-1) if dims else density
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """The same for every action."""
+        shape = value.shape[: value.ndim - len(self.event_shape)]
+        return self.log_density.to(value.dtype).expand(torch.broadcast_shapes(shape, self.batch_shape))
+
+
+def action_shape(dist: d.Distribution) -> torch.Size:
+    """The shape of an action, batch included. TorchRL's one-hot distributions don't say so in their ``event_shape``."""
+    if isinstance(dist, TORCHRL_ONE_HOT) and not dist.event_shape:
+        return dist.batch_shape + dist.logits.shape[-1:]
+    return dist.batch_shape + dist.event_shape
+
+
+def without_independent(dist: d.Distribution) -> d.Distribution:
+    """The distribution of each dimension of an action, where they are independent."""
+    while isinstance(dist, d.Independent):
+        dist = dist.base_dist
+    return dist
 
 
 def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None) -> Tensor:
@@ -58,39 +103,9 @@ def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
         >>> round(cross_entropy(student, teacher).item(), 4)  # -(log 1/4 + log 3/4) / 2
         0.837
     """
-    if num_samples is not None and num_samples < 1:
-        raise ValueError(f"num_samples must be at least 1, got {num_samples}.")
-    _check_same_actions(dist, prior_dist)
-    closed_form = _closed_form(dist, prior_dist)
-    if closed_form is not None:
-        return closed_form
-    if not dist.has_rsample:
-        raise NotImplementedError(
-            f"The cross-entropy of {type(dist).__name__} relative to {type(prior_dist).__name__} has no closed form,"
-            f" and {type(dist).__name__} has no reparameterised samples to estimate it from: give both networks"
-            " distributions of one family (categorical, Gaussian, ...)."
-        )
-    shape = torch.Size([1 if num_samples is None else num_samples])
-    action, log_prob = rsample_and_log_prob(dist, shape)
-    if has_analytic_kl(dist, prior_dist):
-        return d.kl_divergence(dist, prior_dist) - log_prob.mean(0)
-    return -prior_dist.log_prob(action).mean(0)
-
-
-def has_analytic_cross_entropy(dist: d.Distribution, prior_dist: d.Distribution) -> bool:
-    """Whether :func:`cross_entropy` of the pair is exact rather than estimated from samples.
-
-    Examples:
-        >>> import torch
-        >>> from torch.distributions import Categorical
-        >>> has_analytic_cross_entropy(Categorical(torch.ones(2)), Categorical(torch.ones(2)))
-        True
-    """
-    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
-        return True
-    if isinstance(prior_dist, BoxUniform) or (_is_mixture(dist) and _is_gaussian(prior_dist)):
-        return True
-    return has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist)
+    _check(dist, prior_dist, num_samples)
+    exact = _closed_form(dist, prior_dist)
+    return _estimate(dist, prior_dist, num_samples) if exact is None else exact
 
 
 def kl_divergence(dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None) -> Tensor:
@@ -105,21 +120,16 @@ def kl_divergence(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
         >>> kl_divergence(Categorical(torch.ones(2)), Categorical(torch.ones(2))).item()
         0.0
     """
-    if has_analytic_cross_entropy(dist, prior_dist) and has_analytic_entropy(dist):
-        return cross_entropy(dist, prior_dist) - dist.entropy()
-    if has_analytic_kl(dist, prior_dist):
-        return d.kl_divergence(dist, prior_dist)
-    shape = torch.Size([1 if num_samples is None else num_samples])
-    action, log_prob = rsample_and_log_prob(dist, shape)
-    return (log_prob - prior_dist.log_prob(action)).mean(0)
+    _check(dist, prior_dist, num_samples)
+    return _divergence(dist, prior_dist, _closed_form(dist, prior_dist), num_samples)
 
 
 def cross_entropy_of_advice(
     prior_dist: d.Distribution, dist: d.Distribution, *, num_samples: int | None = None
 ) -> Tensor:
     r"""The other direction, :math:`H^X(\pi_0\|\pi)`; actions that the student can't take (masked) cost nothing."""
-    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
-        _check_same_actions(dist, prior_dist)
+    if isinstance(dist, CATEGORICAL) and isinstance(prior_dist, CATEGORICAL):
+        _check(dist, prior_dist, num_samples)
         log_probs = dist.logits.masked_fill(dist.logits.isneginf(), 0.0)
         return categorical_cross_entropy(prior_dist.logits, log_probs)
     return cross_entropy(prior_dist, dist, num_samples=num_samples)
@@ -129,19 +139,17 @@ def cross_entropy_and_kl(
     dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None
 ) -> tuple[Tensor, Tensor]:
     """Both of the above, the divergence without a gradient, for the price of one where there is a closed form."""
-    value = cross_entropy(dist, prior_dist, num_samples=num_samples)
+    _check(dist, prior_dist, num_samples)
+    exact = _closed_form(dist, prior_dist)
+    value = _estimate(dist, prior_dist, num_samples) if exact is None else exact
     with torch.no_grad():
-        if has_analytic_cross_entropy(dist, prior_dist) and has_analytic_entropy(dist):
-            return value, value.detach() - dist.entropy()
-        return value, kl_divergence(dist, prior_dist, num_samples=num_samples)
+        return value, _divergence(dist, prior_dist, exact, num_samples).detach()
 
 
 def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | None:
     """The exact cross-entropy of the pair, or ``None``."""
-    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
-        log_probs, prior_log_probs = dist.logits, prior_dist.logits
-        # an action that the student can't take costs nothing, even where the prior forbids it too: 0 log 0 = 0
-        return categorical_cross_entropy(log_probs, prior_log_probs.masked_fill(log_probs.isneginf(), 0.0))
+    if isinstance(dist, CATEGORICAL) and isinstance(prior_dist, CATEGORICAL):
+        return categorical_cross_entropy(dist.logits, prior_dist.logits)
     if isinstance(prior_dist, BoxUniform):
         return -prior_dist.log_density.expand(torch.broadcast_shapes(dist.batch_shape, prior_dist.batch_shape))
     if isinstance(dist, d.Independent) and isinstance(prior_dist, d.Independent):
@@ -164,9 +172,39 @@ def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | N
             prior_dist.loc.unsqueeze(-1),
             prior_dist.scale.unsqueeze(-1),
         )
-    if has_analytic_cross_entropy(dist, prior_dist):
+    if has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist):
         return d.kl_divergence(dist, prior_dist) + dist.entropy()
     return None
+
+
+def _sample(dist: d.Distribution, num_samples: int | None) -> tuple[Tensor, Tensor]:
+    return rsample_and_log_prob(dist, torch.Size([1 if num_samples is None else num_samples]))
+
+
+def _estimate(dist: d.Distribution, prior_dist: d.Distribution, num_samples: int | None) -> Tensor:
+    """The cross-entropy from samples of the student."""
+    if not dist.has_rsample:
+        raise NotImplementedError(
+            f"The cross-entropy of {type(dist).__name__} relative to {type(prior_dist).__name__} has no closed form,"
+            f" and {type(dist).__name__} has no reparameterised samples to estimate it from: give both networks"
+            " distributions of one family (categorical, Gaussian, ...)."
+        )
+    action, log_prob = _sample(dist, num_samples)
+    if has_analytic_kl(dist, prior_dist):
+        return d.kl_divergence(dist, prior_dist) - log_prob.mean(0)
+    return -prior_dist.log_prob(action).mean(0)
+
+
+def _divergence(
+    dist: d.Distribution, prior_dist: d.Distribution, exact: Tensor | None, num_samples: int | None
+) -> Tensor:
+    """The divergence from the exact cross-entropy where there is one, else from samples."""
+    if exact is not None and has_analytic_entropy(dist):
+        return exact - dist.entropy()
+    if has_analytic_kl(dist, prior_dist):
+        return d.kl_divergence(dist, prior_dist)
+    action, log_prob = _sample(dist, num_samples)
+    return (log_prob - prior_dist.log_prob(action)).mean(0)
 
 
 def _is_gaussian(dist: d.Distribution) -> TypeGuard[d.Independent]:
@@ -179,21 +217,18 @@ def _is_mixture(dist: d.Distribution) -> TypeGuard[d.MixtureSameFamily]:
     return isinstance(dist, d.MixtureSameFamily) and _is_gaussian(dist.component_distribution)
 
 
-def _base(dist: d.Distribution) -> d.Distribution:
-    while isinstance(dist, d.Independent):
-        dist = dist.base_dist
-    return dist
-
-
-def _check_same_actions(dist: d.Distribution, prior_dist: d.Distribution) -> None:
-    student, teacher = _base(dist), _base(prior_dist)
+def _check(dist: d.Distribution, prior_dist: d.Distribution, num_samples: int | None) -> None:
+    """Refuses distributions over different actions, and a teacher without a finite opinion on the student's."""
+    if num_samples is not None and num_samples < 1:
+        raise ValueError(f"num_samples must be at least 1, got {num_samples}.")
+    student, teacher = without_independent(dist), without_independent(prior_dist)
     if isinstance(student, d.Normal) and isinstance(teacher, TanhNormal):
         raise ValueError(
             f"The student's {type(student).__name__} is unbounded, and the prior's {type(teacher).__name__} has no"
             " finite opinion outside of its bounds: give the student bounded actions (TanhNormal), or make the prior a"
             " Gaussian, as std=... does in load_sb3_prior."
         )
-    if isinstance(dist, _CATEGORICAL) and isinstance(prior_dist, _CATEGORICAL):
+    if isinstance(dist, CATEGORICAL) and isinstance(prior_dist, CATEGORICAL):
         shape, prior_shape = dist.logits.shape[-1:], prior_dist.logits.shape[-1:]
     else:
         shape, prior_shape = dist.event_shape, prior_dist.event_shape
