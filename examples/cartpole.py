@@ -15,17 +15,10 @@ from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import (
-    METHODS,
-    ActionPrior,
-    AE2RLoss,
-    ClipPPOPriorLoss,
-    CoeffScheduler,
-    LinearSchedule,
-    PriorWeight,
-    prior_transforms,
-)
+from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
 from torchrl_priors.collectors import make_vector_env
+from torchrl_priors.methods import METHODS
+from torchrl_priors.schedules import CoeffScheduler, LinearSchedule
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--method", choices=METHODS, default="kickstart")

@@ -14,8 +14,9 @@ from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
+from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
 from torchrl_priors.collectors import make_vector_env
+from torchrl_priors.methods import METHODS
 
 
 def balance(observation):

@@ -15,7 +15,8 @@ from torchrl.collectors import Collector
 from torchrl.modules import MLP, ConvNet, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
+from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorWeight, prior_transforms
+from torchrl_priors.methods import METHODS
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--method", choices=METHODS, default="ae2r")

@@ -18,8 +18,9 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, AE2RLoss, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors import ActionPrior, AE2RLoss, PriorBonus, PriorLogProb, PriorWeight
 from torchrl_priors.collectors import make_vector_env
+from torchrl_priors.methods import METHODS
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--method", choices=METHODS, default="ae2r")

@@ -15,8 +15,9 @@ from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.trainers.algorithms import PPOTrainer
 
-from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorShaping, PriorWeight
+from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorShaping, PriorWeight
 from torchrl_priors.collectors import make_vector_env
+from torchrl_priors.methods import METHODS
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--method", choices=METHODS, default="ae2r")

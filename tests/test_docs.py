@@ -15,7 +15,8 @@ import torch
 from test_readme import a_readers_own_objects
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors import ActionPrior, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors.methods import METHODS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -18,7 +18,8 @@ from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import METHODS, ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, PriorBonus, PriorLogProb, PriorWeight
+from torchrl_priors.methods import METHODS
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 FRAMES = 32

@@ -22,8 +22,8 @@ from torchrl.modules import (
 )
 
 from torchrl_priors.distributions import cross_entropy
-from torchrl_priors.lookup import StateTable
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.state_table import StateTable
 
 
 class TestBoltzmannPrior:

@@ -12,17 +12,9 @@ from torchrl.objectives import A2CLoss
 from torchrl.trainers import Trainer
 from trajectories import actor, prior, trajectories
 
-from torchrl_priors import (
-    ActionPrior,
-    AE2RLoss,
-    CoeffScheduler,
-    CosineSchedule,
-    LinearSchedule,
-    PiecewiseSchedule,
-    PriorBonus,
-    PriorLogProb,
-)
+from torchrl_priors import ActionPrior, AE2RLoss, PriorBonus, PriorLogProb
 from torchrl_priors.objectives import CompiledStep
+from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
 
 ANNEAL = LinearSchedule(2.0, 0.5, frames=400)  # in steps that floats hold exactly
 

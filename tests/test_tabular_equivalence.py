@@ -14,12 +14,12 @@ from torchrl.objectives.value import TD0Estimator
 
 from recipes.gridworld import learners, tabular
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
-from torchrl_priors.lookup import StateTable
 from torchrl_priors.methods import METHODS, get_method
 from torchrl_priors.objectives import AE2RLoss
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import BoltzmannPrior
 from torchrl_priors.schedules import CoeffScheduler, CosineSchedule
+from torchrl_priors.state_table import StateTable
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 

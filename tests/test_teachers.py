@@ -23,8 +23,8 @@ from torchrl_priors import (
     RandomDegradation,
     StructuralDegradation,
     UniformPrior,
-    cross_entropy,
 )
+from torchrl_priors.distributions import cross_entropy
 
 OBS, ACTIONS = 3, 4
 

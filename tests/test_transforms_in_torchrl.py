@@ -35,9 +35,9 @@ from trajectories import (
     trajectories,
 )
 
-from torchrl_priors.lookup import StateTable
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import BoltzmannPrior
+from torchrl_priors.state_table import StateTable
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 TRANSFORMS: dict[str, Callable[[], Transform]] = {

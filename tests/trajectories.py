@@ -12,8 +12,8 @@ from torchrl.data import Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from torchrl_priors.functional import categorical_cross_entropy
-from torchrl_priors.lookup import StateTable
 from torchrl_priors.priors import BoltzmannPrior
+from torchrl_priors.state_table import StateTable
 
 STATES, ACTIONS = 7, 3
 

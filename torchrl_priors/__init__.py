@@ -2,19 +2,6 @@
 
 from torchrl_priors.artifacts import load_prior, load_sb3_prior, save_prior
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
-from torchrl_priors.distributions import cross_entropy
-from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
-from torchrl_priors.hooks import PriorShaping
-from torchrl_priors.methods import METHODS, MethodSpec, get_method
-from torchrl_priors.metrics import (
-    area_ratio,
-    area_under_curve,
-    iqm,
-    mean_confidence_interval,
-    performance_profile,
-    probability_of_improvement,
-    stratified_bootstrap_ci,
-)
 from torchrl_priors.objectives import (
     AE2RLoss,
     AVECMixin,
@@ -35,12 +22,11 @@ from torchrl_priors.priors import (
     UniformPrior,
     policy_prior,
 )
-from torchrl_priors.schedules import CoeffScheduler, CosineSchedule, LinearSchedule, PiecewiseSchedule
-from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
+from torchrl_priors.teacher_trial import TeacherTrial
+from torchrl_priors.trainer_hook import PriorShaping
 from torchrl_priors.transforms import PriorBonus, PriorLogProb, prior_transforms
 
 __all__ = [
-    "METHODS",
     "AE2RLoss",
     "AVECMixin",
     "ActionPrior",
@@ -48,16 +34,9 @@ __all__ = [
     "BoltzmannPrior",
     "CallablePrior",
     "ClipPPOPriorLoss",
-    "CoeffScheduler",
-    "CosineSchedule",
-    "GridWorldEnv",
-    "GridWorlds",
-    "LinearSchedule",
-    "MethodSpec",
     "MixturePrior",
     "ModulePrior",
     "MultiTeacherLoss",
-    "PiecewiseSchedule",
     "Plateau",
     "Prior",
     "PriorBonus",
@@ -67,25 +46,14 @@ __all__ = [
     "RandomDegradation",
     "StructuralDegradation",
     "TeacherTrial",
-    "TrialResult",
     "UniformPrior",
     "ValueOffset",
-    "area_ratio",
-    "area_under_curve",
-    "cross_entropy",
-    "get_method",
-    "iqm",
     "load_prior",
     "load_sb3_prior",
-    "mean_confidence_interval",
-    "performance_profile",
     "policy_prior",
     "prior_transforms",
-    "probability_of_improvement",
     "register_configs",
-    "sample_worlds",
     "save_prior",
-    "stratified_bootstrap_ci",
 ]
 
 

@@ -23,10 +23,10 @@ from torchrl.objectives import ClipPPOLoss, PPOLoss
 from torchrl.trainers.algorithms.configs import ConfigBase, HookConfig, LossConfig, TransformConfig
 
 from torchrl_priors.artifacts import load_prior
-from torchrl_priors.hooks import PriorShaping
 from torchrl_priors.objectives import AE2RLoss, ClipPPOPriorLoss
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior, Prior, UniformPrior
+from torchrl_priors.trainer_hook import PriorShaping
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
 
 __all__ = ["register"]

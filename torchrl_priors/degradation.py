@@ -14,8 +14,8 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from torchrl_priors.keys import read
-from torchrl_priors.lookup import StateTable
 from torchrl_priors.priors.prior import NegatedPrior, Prior, PriorWrapper
+from torchrl_priors.state_table import StateTable
 
 __all__ = ["Degradation", "RandomDegradation", "StructuralDegradation"]
 

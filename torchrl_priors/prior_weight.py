@@ -7,7 +7,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
-from torchrl_priors.lookup import StateTable
+from torchrl_priors.state_table import StateTable
 
 __all__ = ["PriorWeight"]
 

@@ -20,7 +20,6 @@ from torchrl_priors import (
     AE2RLoss,
     AVECMixin,
     ClipPPOPriorLoss,
-    CoeffScheduler,
     Prior,
     PriorBonus,
     PriorLogProb,
@@ -32,6 +31,7 @@ from torchrl_priors.collectors import RunningNorm, VectorCollector
 from torchrl_priors.networks import make_actor, make_critic, make_prior_weight
 from torchrl_priors.objectives import CompiledStep
 from torchrl_priors.plateau import Plateau
+from torchrl_priors.schedules import CoeffScheduler
 
 
 class AVECClipPPOLoss(AVECMixin, ClipPPOLoss):

@@ -14,9 +14,9 @@ from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
 from torchrl_priors.artifacts.errors import ArtifactError, short
 from torchrl_priors.artifacts.network import build_network, describe_network
-from torchrl_priors.lookup import StateTable
 from torchrl_priors.priors import Prior
 from torchrl_priors.priors.mixture import FixedWeights
+from torchrl_priors.state_table import StateTable
 
 __all__ = [
     "Parts",

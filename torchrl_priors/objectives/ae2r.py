@@ -72,8 +72,8 @@ class AE2RLoss(NetworksLoss):
             ``raw_advantage``, ``[*B, 1]``.
 
     Keyword Args:
-        method (str or MethodSpec): a key of :data:`~torchrl_priors.METHODS`. ``"none"``, ``"er"`` and ``"kl_penalty"``
-            have no loss here. Defaults to ``"ae2r"``.
+        method (str or MethodSpec): a key of :data:`~torchrl_priors.methods.METHODS`. ``"none"``, ``"er"`` and
+            ``"kl_penalty"`` have no loss here. Defaults to ``"ae2r"``.
         td_error (str): ``"original"`` (a critic that never sees the bonus) or ``"shaped"``. Defaults to ``"original"``.
         weight_target (str, optional): ``"td"``, ``"advantage"``, or ``"none"`` for a weight that this loss only reads.
             Defaults to ``None``: the method's.
@@ -88,7 +88,7 @@ class AE2RLoss(NetworksLoss):
         critic_coeff (float): coefficient of ``loss_prior_critic``. Defaults to 1.0.
         gamma (float): discount. Defaults to 0.99.
         num_samples (int, optional): samples per state where the cross-entropy has no closed form, see
-            :func:`~torchrl_priors.cross_entropy`. Defaults to ``None``.
+            :func:`~torchrl_priors.distributions.cross_entropy`. Defaults to ``None``.
         reduction (str, optional): ``"none"``, ``"mean"`` or ``"sum"``. Defaults to ``"mean"``.
         prior_in_batch (bool): read the parameters of the prior's distribution from the batch instead of running the
             prior, where ``PriorLogProb(prior, ..., keep_params=True)`` left them: once a rollout, not once a minibatch.

@@ -9,9 +9,9 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch import distributions as d
 
-from torchrl_priors.lookup import by_state
 from torchrl_priors.priors.action_prior import ActionPrior, policy_of
 from torchrl_priors.priors.spread import check_epsilon, smoothed_logits
+from torchrl_priors.state_table import by_state
 
 __all__ = ["AffordancePrior"]
 

@@ -14,8 +14,8 @@ from torch import distributions as d
 from torchrl.modules import IndependentNormal, OneHotCategorical
 
 from torchrl_priors.distributions import CATEGORICAL, TORCHRL_ONE_HOT, action_shape, without_independent
-from torchrl_priors.lookup import by_state
 from torchrl_priors.priors.prior import Prior
+from torchrl_priors.state_table import by_state
 
 __all__ = ["FixedWeights", "MixturePrior"]
 

@@ -105,7 +105,7 @@ class PriorBonus(BatchTransform):
 
     @classmethod
     def from_method(cls, method: str, prior_weight: PriorWeight | None = None, **kwargs: Any) -> PriorBonus:
-        """The bonus of a method by name, see :data:`~torchrl_priors.METHODS`.
+        """The bonus of a method by name, see :data:`~torchrl_priors.methods.METHODS`.
 
         Args:
             method (str): e.g. ``"ae2r"``.
