@@ -17,7 +17,7 @@ def pins(name: str) -> dict[str, str]:
 
 
 def lower_bounds() -> dict[str, str]:
-    """Of what a user or a test needs; the tools of developers are free to be any."""
+    """Of what a user, a test or the documentation needs; the tools of developers are free to be any."""
     if sys.version_info < (3, 11):
         pytest.skip("needs tomllib")
     import tomllib
@@ -26,7 +26,7 @@ def lower_bounds() -> dict[str, str]:
     extras = project["optional-dependencies"]
     needed = [
         *project["dependencies"],
-        *(line for name in ("artifacts", "recipes", "mujoco", "sweeps", "test") for line in extras[name]),
+        *(line for name in ("artifacts", "recipes", "mujoco", "sweeps", "test", "docs") for line in extras[name]),
     ]
     found = (re.match(r"([\w-]+)(?:\[\w+\])?>=([\w.]+)", line) for line in needed)
     return dict(match.groups() for match in found if match)  # type: ignore[misc]
