@@ -19,7 +19,7 @@ from recipes.common.sweeps import cores
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
 submitit = pytest.importorskip("submitit")
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 # A recipe that does nothing, below the configuration of those that do: its launchers are theirs.
 RECIPE = """

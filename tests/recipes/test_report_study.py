@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from recipes.report import figures
 from recipes.report.page import report
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("without_pictures")
 
 

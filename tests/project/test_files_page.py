@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from mujoco_cases import run
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/guides/files.md").read_text(encoding="utf-8")
 GRIDWORLD, RUN, STUDY, REPORT, PAPER = (
     "A gridworld study",

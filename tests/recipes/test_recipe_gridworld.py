@@ -22,7 +22,7 @@ from recipes.gridworld.study import open_folder
 from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors.methods import METHODS
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PRIORS = ["expert", "random_15", "random_30", "random_50", "structural_3", "structural_5", "structural_10"]
 TINY = ["study=small", "workers=1", "teacher.steps=500", "teacher.eval_episodes=2", "bootstrap.reps=50"]
 TINY += ["evaluation.points=5", "evaluation.interval=20"]

@@ -30,7 +30,7 @@ from torchrl_priors.artifacts import ArtifactError, load_prior, load_sb3_prior, 
 from torchrl_priors.artifacts.sb3_files import read_vecnormalize
 from torchrl_priors.priors import ModulePrior
 
-CONF = Path(__file__).parents[1] / "conf"
+CONF = Path(__file__).parents[2] / "conf"
 NUMBER = 1000
 TOLERANCE = {"atol": 1e-6, "rtol": 0.0}
 

@@ -32,7 +32,7 @@ from torchrl_priors.artifacts import ArtifactError, PriorManifest, read_manifest
 from torchrl_priors.collectors import RunningNorm
 from torchrl_priors.networks import make_actor, make_critic
 
-TEACHERS = sorted((Path(__file__).parents[1] / "results/mujoco/teachers").glob("*.safetensors"))
+TEACHERS = sorted((Path(__file__).parents[2] / "results/mujoco/teachers").glob("*.safetensors"))
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from recipes.gridworld.study import TaughtWorld, make_learner, run_world
 from recipes.show_weight.show import mean_over, show
 from torchrl_priors import load_prior
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20"]
 
 

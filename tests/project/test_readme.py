@@ -15,7 +15,7 @@ from torchrl.envs import CatTensors, Compose, InitTracker, StepCounter, Transfor
 from torchrl.envs.custom import PendulumEnv
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SMALL = ["compile=false", "ppo.hidden=[8]", "ppo.epochs=1", "env.num_envs=2", "env.frames_per_batch=64"]
 SMALL += ["env.minibatch_size=32", "evaluation.episodes=2"]
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from recipes.mujoco import train
 from recipes.mujoco.run import Run
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TINY = [
     "env.num_envs=2",
     "env.frames_per_batch=64",

@@ -123,7 +123,7 @@ class TestContinuing:
     def test_another_process_continues_to_the_bit(self, tmp_path: Path) -> None:
         script = f"""
 import sys, torch
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path.insert(0, {str(Path(__file__).parents[1] / "cases")!r})
 torch.set_num_threads(1)
 from test_collectors_state import collector
 torch.manual_seed(0)
@@ -136,7 +136,7 @@ torch.save(collecting.rollout().to_dict(), {str(tmp_path / "out.pt")!r})
         first = collector("Ant-v5")
         rollouts(first, 2)
         torch.save({"policy": first.policy.state_dict(), "collector": first.state_dict()}, tmp_path / "in.pt")
-        subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[1])
+        subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
         expected, found = first.rollout(), torch.load(tmp_path / "out.pt", weights_only=True)
         for key in ("observation", "action", "action_log_prob"):
             assert torch.equal(expected[key], found[key])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 PARTS = {"catch.py"}  # imported by another
 SCRIPTS = sorted(path.name for path in EXAMPLES.glob("*.py") if path.name not in PARTS)
 FRAMES = {"a2c.py": 10_240, "ppo.py": 3200, "pixels.py": 1536, "trial.py": 10_240, "from_yaml.py": 2048}

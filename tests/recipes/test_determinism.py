@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MUJOCO = ["env.num_envs=2", "env.frames_per_batch=64", "env.minibatch_size=32", "total_frames=128", "ppo.epochs=1"]
 MUJOCO += ["ppo.hidden=[8]", "evaluation.interval=64", "evaluation.episodes=2", "checkpoint.interval=128"]
 MUJOCO += ["compile=false", "seed=3"]

@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE
 from torchrl_priors import ActionPrior, PriorBonus, PriorLogProb, PriorWeight
 from torchrl_priors.methods import METHODS
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = {path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))}
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.DOTALL | re.MULTILINE)

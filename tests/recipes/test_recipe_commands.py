@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 REQUIRED = {
     "report": ["runs"],
     "export_best": ["runs", "env_id", "out"],

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 import recipes.report.config  # noqa: F401 (stores the schema)
 from torchrl_priors.methods import get_method
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 POINTS = np.arange(1, 21) * 50_000
 #: Return that a method ends with under a good and a bad prior, as a share of the environment's scale.
 LEVEL = {"none": (0.55, 0.55), "e2r": (0.95, 0.1), "ae2r": (0.75, 0.4), "kickstart": (0.9, 0.15), "aligned": (0.9, 0.5)}

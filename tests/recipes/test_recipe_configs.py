@@ -18,7 +18,7 @@ from recipes.gridworld import config as gridworld_config
 from recipes.mujoco import task
 from recipes.report import config as report_config
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CHECKS: dict[str, Callable[[Any], None]] = {
     "gridworld": gridworld_config.check,
     "mujoco": task.open_task,

@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
-from hydra import compose, initialize_config_dir
-from mujoco_cases import ROOT, interrupt, run
+from mujoco_cases import interrupt, run
 
-from recipes.report.runs import find, name_groups, read, without_misfits
+from recipes.report.runs import find, name_priors, read, without_misfits
 from recipes.show_weight.episode import load_agent
 from torchrl_priors import Plateau, TeacherTrial
 
@@ -34,12 +32,6 @@ def teachers(tmp_path_factory) -> Path:
 @pytest.fixture
 def trial(teachers) -> list[str]:
     return ["method=trial", f"prior.path={teachers / 'first.safetensors'}", *SHORT]
-
-
-def compose_report(runs: Path) -> Any:
-    """The configuration of a report."""
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("report", overrides=[f"runs={runs}"])
 
 
 def winner(out: Path) -> str:
@@ -151,8 +143,7 @@ def test_a_report_takes_a_trial_as_the_student_who_won_it(trial, tmp_path):
     run(tmp_path / "trial", *trial)
     run(tmp_path / "none")
     runs, left_out = read(find(str(tmp_path)))
-    cfg: Any = compose_report(tmp_path)
-    name_groups(runs, cfg)
+    name_priors(runs)
     assert not left_out
     assert sorted(run.label for run in runs) == ["none", "trial"]
     taken = next(run for run in runs if run.method == "trial")
