@@ -12,6 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import nn
 from torchrl.envs import RewardSum
+from torchrl.modules import ValueOperator
 
 import torchrl_priors
 from torchrl_priors import ActionPrior, AE2RLoss, PriorBonus, PriorLogProb, PriorShaping, PriorWeight, UniformPrior
@@ -78,6 +79,19 @@ def test_leaves_of_python_and_settings_of_yaml_make_a_loss(folder: Path) -> None
     assert loss.spec.bonus == "next"
     assert loss.aux_coeff.item() == pytest.approx(0.1)
     assert loss.tensor_keys.reward == ("agent", "reward")
+
+
+@pytest.mark.parametrize("td_error", ["original", "shaped"])
+def test_ppo_of_yaml_gives_its_networks_to_the_priors_loss(folder: Path, td_error: str) -> None:
+    overrides = ["+loss@ppo=clip_ppo_prior", "loss.method=ae2r", f"loss.td_error={td_error}", "loss._partial_=true"]
+    config = composed(folder, *overrides, "loss.actor_network=null", "ppo.prior_loss=${loss}")
+    actor, critic = make_actor(), ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+    config.loss.critic_network = {"_target_": "torchrl.modules.ValueOperator", "module": "${weight.net}"}
+    config.loss.prior_weight = "${weight}"
+    loss = instantiate(config.ppo, actor_network=actor, critic_network=critic)
+    assert loss.prior_loss.actor_network is actor
+    assert (loss.prior_loss.critic_network is critic) == (td_error == "shaped")
+    assert loss.prior_loss.tensor_keys.reward == ("agent", "reward")
 
 
 def test_objects_of_python_are_shared_with_a_transform_of_yaml(folder: Path) -> None:

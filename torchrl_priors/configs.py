@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import field, make_dataclass
+from functools import partial
 from typing import Any
 
 try:
@@ -121,10 +122,10 @@ def make_clip_ppo_prior_loss(
     Two references to one network in YAML are two networks: ``prior_loss``, a config of ``loss: ae2r`` with ``_partial_:
     true``, is given this loss's student, and its critic where ``td_error: shaped``.
     """
-    shared = {"actor_network": actor_network}
-    if prior_loss.keywords.get("td_error") == "shaped":
-        shared["critic_network"] = critic_network
-    loss = ClipPPOPriorLoss(actor_network, critic_network, prior_loss(**shared), **_settings(settings))
+    if isinstance(prior_loss, partial):
+        shaped = prior_loss.keywords.get("td_error") == "shaped"
+        prior_loss = prior_loss(actor_network=actor_network, **({"critic_network": critic_network} if shaped else {}))
+    loss = ClipPPOPriorLoss(actor_network, critic_network, prior_loss, **_settings(settings))
     loss.set_keys(**{name: nested_key(key) for name, key in (keys or {}).items()})
     return loss
 

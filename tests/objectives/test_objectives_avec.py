@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import A2CLoss, ClipPPOLoss, ReinforceLoss
 
-from torchrl_priors.objectives import AVECMixin, ClipPPOPriorLoss, ValueOffset
+from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, ValueOffset
 
 
 class AVECClipPPO(AVECMixin, ClipPPOLoss):
@@ -23,8 +23,9 @@ class AVECA2C(AVECMixin, A2CLoss):
 
 
 class AVECClipPPOPrior(AVECMixin, ClipPPOPriorLoss):
-    def __init__(self, actor, critic, **kwargs):
-        super().__init__(actor, critic, make_actor(), method="kickstart", **kwargs)
+    def __init__(self, actor, critic, functional=True, **kwargs):
+        prior_loss = AE2RLoss(actor, make_actor(), method="kickstart", functional=functional)
+        super().__init__(actor, critic, prior_loss, **kwargs)
 
 
 LOSSES = {AVECClipPPO: ClipPPOLoss, AVECA2C: A2CLoss, AVECClipPPOPrior: ClipPPOLoss}

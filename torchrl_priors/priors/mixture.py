@@ -59,6 +59,9 @@ class MixturePrior(Prior):
         tensor([[0.7500, 0.2500]])
     """
 
+    priors: Any
+    """Those that are mixed, a :class:`~torch.nn.ModuleList`."""
+
     def __init__(
         self,
         priors: Sequence[Prior],
@@ -82,8 +85,6 @@ class MixturePrior(Prior):
         self.weights = of_state
         if len(self.draw_keys) < sum(len(prior.draw_keys) for prior in priors):
             raise ValueError("Two priors of the mixture keep their random draws under one key: pass draw_key to one.")
-
-    priors: Any
 
     @property
     def draw_keys(self) -> list[NestedKey]:
