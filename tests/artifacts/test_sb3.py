@@ -55,8 +55,8 @@ def observations(case: Model, number: int = NUMBER) -> np.ndarray:
     return rng.normal(size=(number, 3)) * np.array([0.1, 1.0, 30.0]) + 2
 
 
-def convert(model: Saved, name: str) -> ModulePrior:
-    return load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.1 if name == "td3" else None)
+def convert(model: Saved, name: str, **kwargs: Any) -> ModulePrior:
+    return load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.1 if name == "td3" else None, **kwargs)
 
 
 def batch_of(raw: np.ndarray) -> TensorDict:
@@ -76,8 +76,7 @@ class TestConversion:
         dist = convert(model, name).get_dist(batch_of(raw))
         if expected.is_floating_point():
             action = dist.deterministic_sample if name == "sac" else dist.mean
-            low, high = torch.as_tensor(BOX.low), torch.as_tensor(BOX.high)
-            torch.testing.assert_close(torch.minimum(torch.maximum(action, low), high), expected, **TOLERANCE)
+            torch.testing.assert_close(action, expected, **TOLERANCE)
             assert expected.std(0).min() > 0.01  # not all at a bound
         else:
             assert torch.equal(dist.probs.argmax(-1), expected)
@@ -88,7 +87,7 @@ class TestConversion:
         seen = model.env.normalize_obs(raw) if model.vecnormalize else raw
         policy = model.model.policy
         tensor = policy.obs_to_tensor(seen)[0]
-        prior, batch = convert(model, name), batch_of(raw)
+        prior, batch = convert(model, name, clip_mean=False), batch_of(raw)
         with torch.no_grad():
             if name == "td3":
                 pytest.skip("TD3 has no distribution of its own")
@@ -149,6 +148,32 @@ class TestConversion:
         normal = load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.3).get_dist(batch)
         torch.testing.assert_close(normal.mean, squashed.deterministic_sample, **TOLERANCE)
         assert (normal.stddev == 0.3).all()
+
+    @pytest.mark.parametrize("std", [None, 0.3])
+    def test_the_mean_stays_within_the_bounds_unless_it_shall_be_raw(
+        self, saved: Callable[[str], Saved], std: float | None, tmp_path: Path
+    ) -> None:
+        batch, low, high = batch_of(observations(MODELS["a2c"])), torch.as_tensor(BOX.low), torch.as_tensor(BOX.high)
+        clipped, raw = (load_sb3_prior(saved("a2c").path, std=std, clip_mean=clip) for clip in (True, False))
+        mean = raw.get_dist(batch).mean
+        assert (mean > high).any() and (mean < low).any()
+        save_prior(tmp_path / "teacher", clipped, env_id="Noise-v0")
+        for prior in (clipped, load_prior(tmp_path / "teacher")):
+            assert torch.equal(prior.get_dist(batch).mean, mean.clamp(low, high))
+            assert torch.equal(prior.get_dist(batch).stddev, raw.get_dist(batch).stddev)
+
+    @pytest.mark.parametrize(("low", "high"), [(-np.inf, np.inf), (-np.inf, 0.2)])
+    def test_actions_without_a_bound_are_not_clipped_there(
+        self, saved: Callable[[str], Saved], tmp_path: Path, low: float, high: float
+    ) -> None:
+        space = base64.b64encode(pickle.dumps(spaces.Box(low, high, (2,)))).decode()
+        change = {"action_space": {":serialized:": space}}
+        path = rewrite(saved("a2c").path, tmp_path / "model.zip", data=lambda data: {**data, **change})
+        batch = batch_of(observations(MODELS["a2c"]))
+        found, raw = (load_sb3_prior(path, clip_mean=clip) for clip in (True, False))
+        mean = raw.get_dist(batch).mean
+        assert mean.max() > 0.2
+        assert torch.equal(found.get_dist(batch).mean, mean.clamp(low, high))
 
     def test_discrete_advice_can_be_one_hot(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
         path, batch = saved("ppo_discrete").path, batch_of(observations(MODELS["ppo_discrete"], 20))

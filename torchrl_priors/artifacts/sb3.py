@@ -17,7 +17,14 @@ from torchrl_priors.artifacts.network import check_values
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors import ModulePrior
-from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
+from torchrl_priors.priors.layers import (
+    ClipToBox,
+    GaussianHead,
+    NatureCNN,
+    ScaleToBox,
+    StateIndependentStd,
+    TeacherInput,
+)
 
 __all__ = ["load_sb3_prior"]
 
@@ -27,6 +34,7 @@ def load_sb3_prior(
     *,
     vecnormalize: str | os.PathLike[str] | None = None,
     std: float | Tensor | None = None,
+    clip_mean: bool = True,
     activation: str | None = None,
     one_hot: bool = False,
     in_key: NestedKey = "observation",
@@ -42,7 +50,8 @@ def load_sb3_prior(
 
     * PPO, A2C, discrete actions: a :class:`~torch.distributions.Categorical` over indices, or, with ``one_hot``, a
       :class:`~torchrl.modules.OneHotCategorical`, as the students of a :func:`~torchrl.envs.GymEnv` are by default;
-    * PPO, A2C, continuous: a Gaussian, before the clipping to the bounds that Stable-Baselines3 does when it acts;
+    * PPO, A2C, continuous: a Gaussian whose mean is clipped to the bounds of the actions, as Stable-Baselines3 clips
+      what it sends. With ``clip_mean=False`` it is the policy's own, and so are its log-probabilities;
     * SAC: a :class:`~torchrl.modules.TanhNormal` within the bounds. Stable-Baselines3's own ``log_prob`` is that of
       actions scaled to [-1, 1], and adds 1e-6 to :math:`1-\tanh^2`; this one is exact;
     * TD3, and any other continuous one with ``std``: a Gaussian around the deterministic action. A Gaussian student of
@@ -59,6 +68,8 @@ def load_sb3_prior(
         std (float or Tensor, optional): standard deviation of a Gaussian around the deterministic action, in the unit
             of the action, a number or one per dimension; required for TD3. Defaults to ``None``: the policy's own
             distribution.
+        clip_mean (bool): whether the mean of a policy of PPO or A2C is clipped to the bounds of the actions, where they
+            are finite. Defaults to ``True``: a mean far beyond would draw a student there, where nothing changes.
         activation (str, optional): what the policy must have, one of :data:`~torchrl_priors.networks.ACTIVATIONS`: only
             a check, for what the file says counts, and if it says nothing Stable-Baselines3's default (tanh for PPO and
             A2C, ReLU for SAC and TD3). Defaults to ``None``: not checked.
@@ -113,6 +124,7 @@ def load_sb3_prior(
             layers.append(parts.linear("action_net."))
             if not discrete:
                 log_std = parts.take("log_std")
+                layers += [_clip(checkpoint)] if clip_mean else []
                 layers += [StateIndependentStd(log_std)] if std is None else []
         parts.check_all_taken()
         _check_sizes(layers, checkpoint)
@@ -174,6 +186,12 @@ def _bounds(checkpoint: Checkpoint) -> tuple[Tensor, Tensor]:
     if not (low.isfinite().all() and high.isfinite().all() and (low < high).all()):
         raise ArtifactError(f"its actions must have finite bounds, got {low.tolist()} and {high.tolist()}")
     return low, high
+
+
+def _clip(checkpoint: Checkpoint) -> ClipToBox:
+    """To the bounds of the actions, as far as they are finite."""
+    space = checkpoint.action_space
+    return ClipToBox(torch.as_tensor(space.low).float(), torch.as_tensor(space.high).float())
 
 
 def _first_layers(
