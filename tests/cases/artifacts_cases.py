@@ -97,7 +97,7 @@ STORABLE: dict[str, Callable[[], ActionPrior]] = {
         nn.Sequential(net(), nn.Tanh(), ScaleToBox(-torch.ones(ACTIONS), torch.ones(ACTIONS))), "mean", std=0.2
     ),
     "clipped": lambda: gaussian(
-        net(), ClipToBox(torch.zeros(ACTIONS), torch.tensor([1.0, 2.0, torch.inf])), StateIndependentStd(torch.zeros(ACTIONS))
+        net(), ClipToBox(torch.zeros(3), torch.tensor([1.0, 2.0, torch.inf])), StateIndependentStd(torch.zeros(3))
     ),
     "own_std": lambda: gaussian(normalised(clip=3), net(), StateIndependentStd(torch.randn(ACTIONS))),
     "head": lambda: gaussian(normalised(eps=0.1), GaussianHead(OBS, ACTIONS, log_std_range=(-3, 1.5))),

@@ -82,7 +82,9 @@ class TeacherInput(nn.Module):
         observation = observation.float()
         if self.pixels:
             observation = observation / 255.0
-        return observation.reshape(*observation.shape[:batch_ndim], -1) if self.flatten else observation
+        if not self.flatten:
+            return observation
+        return observation.reshape(*observation.shape[:batch_ndim], math.prod(self.shape))
 
 
 class StateIndependentStd(nn.Module):
