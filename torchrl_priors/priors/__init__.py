@@ -8,6 +8,7 @@ from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.policy import policy_prior
 from torchrl_priors.priors.prior import Prior
+from torchrl_priors.priors.rescale import RescaledPrior
 from torchrl_priors.priors.uniform import UniformPrior
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "MixturePrior",
     "ModulePrior",
     "Prior",
+    "RescaledPrior",
     "UniformPrior",
     "policy_prior",
 ]
