@@ -253,7 +253,7 @@ class AE2RLoss(NetworksLoss):
 
     @property
     def teachers(self) -> list[AE2RLoss]:
-        """The loss of each teacher: this one."""
+        """This loss, which is that of its one teacher."""
         return [self]
 
     @property

@@ -108,7 +108,7 @@ class Prior(TensorDictModuleBase, ABC):
         """The distribution over actions at the states of ``tensordict``, which stays as it is.
 
         Args:
-            tensordict (TensorDictBase): holds :attr:`in_keys`, batch ``[*B]``.
+            tensordict (TensorDictBase): holds ``in_keys``, batch ``[*B]``.
         """
         return self.build_dist(self.get_params(tensordict))
 
@@ -116,7 +116,7 @@ class Prior(TensorDictModuleBase, ABC):
         r"""Log-probability of the action that was taken, :math:`\log\pi_0(a_t|s_t)`.
 
         Args:
-            tensordict (TensorDictBase): holds :attr:`in_keys` and the action, batch ``[*B]``.
+            tensordict (TensorDictBase): holds ``in_keys`` and the action, batch ``[*B]``.
 
         Keyword Args:
             dist (torch.distributions.Distribution, optional): from :meth:`get_dist`, to save its computation.
@@ -164,7 +164,7 @@ class Prior(TensorDictModuleBase, ABC):
     def policy(self) -> TensorDictModuleBase:
         """The prior as a policy that acts, e.g. ``env.rollout(1000, prior.policy())``.
 
-        It writes the action, sampled or the mode, by :func:`~torchrl.envs.utils.set_exploration_type`; by default
+        It writes the action, sampled or the mode, by TorchRL's ``set_exploration_type``; by default
         the mode, as TorchRL's actors do.
 
         Examples:
@@ -177,7 +177,7 @@ class Prior(TensorDictModuleBase, ABC):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the parameters of the distribution under the namespace, in :attr:`out_keys`."""
+        """Writes the parameters of the distribution under the namespace, in ``out_keys``."""
         for key, value in zip(self.out_keys, self.get_params(tensordict).values(), strict=True):
             tensordict.set(key, value)
         return tensordict
