@@ -15,7 +15,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from recipes.common.checks import at_home
-from torchrl_priors.artifacts.format import write_atomically
+from torchrl_priors.atomic import write_atomically
 
 __all__ = ["RunFolder", "digest", "flatten", "read_json", "refuse_foreign", "sha256", "write_file"]
 
