@@ -8,7 +8,7 @@ from matplotlib.colors import to_hex
 
 from torchrl_priors.metrics import ConfidenceInterval
 from torchrl_priors.plots import curve_panels, interval_panels, method_color, profile_panels
-from torchrl_priors.plots.panels import variant_label, variant_styles
+from torchrl_priors.plots.variants import variant_label, variant_styles
 
 STEPS = np.arange(1.0, 4.0)
 BAND = ConfidenceInterval(STEPS, STEPS - 1, STEPS + 1)

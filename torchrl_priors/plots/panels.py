@@ -1,17 +1,15 @@
 """Panels of methods and their variants, for each environment, teacher or prior: curves, profiles and intervals.
 
-A method may come with settings, as in ``"ae2r Cω=0.03"``: it keeps the method's colour, in a lighter shade and another
-dash for each variant.
+A method may come with settings, as in ``"ae2r Cω=0.03"``: see :mod:`torchrl_priors.plots.variants`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -19,18 +17,16 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 from torchrl_priors.metrics import MIN_RUNS, ConfidenceInterval, performance_profile
 from torchrl_priors.plots.style import (
-    BASELINE,
     COLUMN_WIDTH,
     TEXT_WIDTH,
-    line_style,
-    method_label,
     new_figure,
     outer_labels,
     paper_style,
     thousands,
 )
+from torchrl_priors.plots.variants import variant_label, variant_styles
 
-__all__ = ["curve_panels", "interval_panels", "profile_panels", "variant_label", "variant_styles"]
+__all__ = ["curve_panels", "interval_panels", "profile_panels"]
 
 Places: TypeAlias = Mapping[str, tuple[int, int]]
 
@@ -44,45 +40,6 @@ _MARKER: dict[str, Any] = {
     "linestyle": "none",
     "zorder": 5,
 }
-_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.2)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-
-
-def variant_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """The line of each method and variant; variants of a method follow each other from dark to light.
-
-    Examples:
-        >>> styles = variant_styles(["e2r", "ae2r Cω=1", "ae2r Cω=0.03"])
-        >>> [style["color"] for style in styles.values()]
-        ['#d55e00', '#0072b2', '#66aad1']
-    """
-    names = list(dict.fromkeys(names))
-    styles = {}
-    for name in names:
-        family = [other for other in names if _base(other) == _base(name)]
-        place = family.index(name)
-        light = 0.6 * place / max(1, len(family) - 1) if len(family) > 2 else 0.4 * place
-        red, green, blue = (part * (1 - light) + light for part in to_rgb(line_style(_base(name))["color"]))
-        style = {**line_style(_base(name)), "color": to_hex((red, green, blue))}
-        if _base(name) != BASELINE:
-            style["linestyle"] = _DASHES[place % len(_DASHES)]
-        styles[name] = style
-    return styles
-
-
-def variant_label(name: str, baseline: str | None = None) -> str:
-    r"""A method and its variant as they are printed; the baseline may have a name of its own.
-
-    Examples:
-        >>> variant_label("ae2r Cω=0.03"), variant_label("none", baseline="PPO")
-        ('AE2R $C_\\omega$=0.03', 'PPO')
-    """
-    base, settings = _base(name), name.partition(" ")[2].replace("Cω", r"$C_\omega$")
-    shown = baseline if base == BASELINE and baseline else method_label(base)
-    return f"{shown} {settings}" if settings else shown
-
-
-def _base(name: str) -> str:
-    return name.partition(" ")[0]
 
 
 @paper_style
