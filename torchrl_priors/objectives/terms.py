@@ -14,7 +14,7 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_priors.distributions import cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
 from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
-from torchrl_priors.keys import keep_where, read, under_next
+from torchrl_priors.keys import next_step, read, under_next
 
 if TYPE_CHECKING:
     from torchrl_priors.objectives.ae2r import AE2RLoss
@@ -129,7 +129,8 @@ class RawCriticTerm(Term):
         with contextlib.nullcontext() if loss.trains_critic else torch.no_grad():
             value = loss.evaluate("critic_network", tensordict, names.value)
         with torch.no_grad():
-            next_value = loss.evaluate("critic_network", tensordict.get("next"), names.value)
+            following = next_step(tensordict, loss.critic_network.in_keys, terminated)
+            next_value = loss.evaluate("critic_network", following, names.value)
             target = td_residual(torch.zeros_like(next_value), reward, next_value, terminated, loss.gamma)
             found["prior_td_error"] = target - value
         if loss.trains_critic:
@@ -200,8 +201,7 @@ class WeightTerm(Term):
         terminated = read(tensordict, under_next(names.terminated), HINT)
         signal = prior_bonus(loss.bonus_coeff, read(tensordict, under_next(names.prior_log_prob), HINT))
         signal = torch.where(terminated, torch.zeros_like(signal), signal)
-        # what follows an end may be no observation (NaN where environments reset themselves)
-        weight = self._weight(keep_where(~terminated, tensordict.get("next").select(*loss.prior_weight.in_keys)))
+        weight = self._weight(next_step(tensordict, loss.prior_weight.in_keys, terminated))
         found["loss_prior_weight"] = _regression(-found["prior_td_error"], weight, signal)
         if loss.spec.auxiliary:
             with torch.no_grad():

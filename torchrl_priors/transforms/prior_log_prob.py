@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
-from torchrl_priors.keys import check_option, read, under_next
+from torchrl_priors.keys import check_option, next_step, read, under_next
 from torchrl_priors.priors import Prior
 from torchrl_priors.transforms.batch_transform import BatchTransform
 
@@ -143,7 +143,10 @@ class PriorLogProb(BatchTransform):
         # only the time steps at which some trajectory was cut
         steps = wanted.movedim(time_dim, 0).flatten(1).any(-1).nonzero().squeeze(-1)
         if self.boundary != "zero" and len(steps):
-            following = tensordict.get("next")[(slice(None),) * time_dim + (steps,)]
+            keys = dict.fromkeys([*self.prior.in_keys, *self.__dict__["actor"].in_keys, *self.prior.draw_keys])
+            cut = (slice(None),) * time_dim + (steps,)
+            part = tensordict.select(*keys, *map(under_next, keys), strict=False)[cut]
+            following = next_step(part, keys, terminated[cut])
             at_boundary.index_copy_(time_dim, steps, self._evaluate_boundary(following).to(value.dtype))
 
         (key,) = self.out_keys
