@@ -13,7 +13,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from torchrl_priors.methods import METHODS
+from torchrl_priors.methods import METHODS, MethodSpec
 from torchrl_priors.metrics import (
     ConfidenceInterval,
     mean_confidence_interval,
@@ -29,6 +29,7 @@ from torchrl_priors.plots import (
     prior_label,
     profile_panels,
     save_figure,
+    style,
 )
 
 PRIORS = ["expert", "random_15", "random_30", "random_50", "structural_3", "structural_5", "structural_10"]
@@ -151,6 +152,11 @@ assert "matplotlib.pyplot" not in sys.modules
 class TestNames:
     def test_every_method_has_a_colour_and_a_label_of_its_own(self):
         assert len({method_color(m) for m in METHODS}) == len({method_label(m) for m in METHODS}) == len(METHODS)
+
+    def test_a_preset_without_a_label_is_called_by_its_name(self, monkeypatch):
+        monkeypatch.setitem(style._METHODS, "mine", (MethodSpec("none", auxiliary=True, adaptive=False).label, ""))
+        assert method_label("mine") == "mine"
+        assert to_rgb(method_color("mine"))
 
     def test_unknown_method_keeps_its_colour(self):
         assert method_color("mine") == method_color("mine")

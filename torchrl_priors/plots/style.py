@@ -70,6 +70,7 @@ BASELINE = "none"
 
 #: The trial is no method of a loss: the recipe's name for finding out which one to use.
 _METHODS = {name: (spec.label, spec.color) for name, spec in METHODS.items()} | {"trial": ("Trial", "#117733")}
+_UNNAMED = ("", "")
 _OTHER_COLORS = ("#44AA99", "#DDCC77", "#AA4499", "#661100")
 
 
@@ -80,7 +81,7 @@ def method_label(name: str) -> str:
         >>> method_label("ae2r"), method_label("mine")
         ('AE2R', 'mine')
     """
-    return _METHODS[name][0] if name in _METHODS else name
+    return _METHODS.get(name, _UNNAMED)[0] or name
 
 
 def method_color(name: str) -> str:
@@ -90,9 +91,7 @@ def method_color(name: str) -> str:
         >>> method_color("none"), method_color("ae2r")
         ('#000000', '#0072B2')
     """
-    if name in _METHODS:
-        return _METHODS[name][1]
-    return _OTHER_COLORS[sum(name.encode()) % len(_OTHER_COLORS)]
+    return _METHODS.get(name, _UNNAMED)[1] or _OTHER_COLORS[sum(name.encode()) % len(_OTHER_COLORS)]
 
 
 def prior_label(name: str) -> str:
