@@ -27,7 +27,9 @@ class ResetsItself(EnvBase):
         self.observation_spec = Composite(observation=Unbounded((ENVS, 3)), shape=(ENVS,))
         self.action_spec = Categorical(2, shape=(ENVS,))
         self.reward_spec = Unbounded((ENVS, 1))
-        flags = {name: Categorical(2, shape=(ENVS, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        flags = {
+            name: Categorical(2, shape=(ENVS, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")
+        }
         self.full_done_spec = Composite(**flags, shape=(ENVS,))
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
@@ -75,7 +77,9 @@ def test_no_end_of_a_trajectory_spoils_a_loss(method: str, weight_target: Any, c
     if weight_target is not None and not METHODS[method].adaptive:
         pytest.skip("no weight")
     networks = (make_weight(), make_critic()) if METHODS[method].adaptive else (None, None)
-    loss = ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, prior, *networks, method=method, weight_target=weight_target))
+    loss = ClipPPOPriorLoss(
+        actor, critic, AE2RLoss(actor, prior, *networks, method=method, weight_target=weight_target)
+    )
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
     advantage.set_keys(reward=loss.tensor_keys.reward)
     batch = collect(actor)
