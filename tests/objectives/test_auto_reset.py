@@ -27,7 +27,9 @@ class ResetsItself(EnvBase):
         self.observation_spec = Composite(observation=Unbounded((ENVS, 3)), shape=(ENVS,))
         self.action_spec = Categorical(2, shape=(ENVS,))
         self.reward_spec = Unbounded((ENVS, 1))
-        flags = {name: Categorical(2, shape=(ENVS, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        flags = {
+            name: Categorical(2, shape=(ENVS, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")
+        }
         self.full_done_spec = Composite(**flags, shape=(ENVS,))
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
@@ -75,7 +77,9 @@ def test_no_end_of_a_trajectory_spoils_a_loss(method: str, weight_target: Any, c
     if weight_target is not None and not METHODS[method].adaptive:
         pytest.skip("no weight")
     networks = (make_weight(), make_critic()) if METHODS[method].adaptive else (None, None)
-    loss = ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, prior, *networks, method=method, weight_target=weight_target))
+    loss = ClipPPOPriorLoss(
+        actor, critic, AE2RLoss(actor, prior, *networks, method=method, weight_target=weight_target)
+    )
     advantage = GAE(gamma=0.99, lmbda=0.95, value_network=critic)
     advantage.set_keys(reward=loss.tensor_keys.reward)
     batch = collect(actor)
@@ -102,4 +106,4 @@ def test_this_step_takes_the_place_of_a_missing_next_one_as_in_gae(method: str) 
     for key in ("prior_log_prob", "prior_bonus", "shaped_reward"):
         assert torch.equal(results[0]["next", key], results[1]["next", key])
     first, second = (loss(batch) for batch in results)
-    assert all(torch.equal(first[key], second[key]) for key in first.keys())
+    assert all(torch.equal(first[key], second[key]) for key in first)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_priors.advice import check_advice
 from torchrl_priors.distributions import cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
 from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
 from torchrl_priors.keys import next_step, read, under_next
@@ -84,8 +85,7 @@ class AuxiliaryTerm(Term):
             prior_dist = self._prior_dist(tensordict)
         with contextlib.nullcontext() if loss.spec.auxiliary else torch.no_grad():
             if dist is None:
-                with loss.params_of("actor_network"):
-                    dist = loss.actor_network.get_dist(tensordict.copy())
+                dist = self._student_dist(tensordict)
             entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=samples)
             pull = entropy
             if loss.spec.cross_entropy == "teacher":
@@ -93,11 +93,21 @@ class AuxiliaryTerm(Term):
             elif loss.kl_share is not None:
                 divergence = kl_divergence(dist, prior_dist, num_samples=samples)
                 pull = torch.lerp(entropy, divergence, loss.kl_share)
+        used = pull + entropy if loss.spec.adaptive and loss.weight_target == "advantage" else pull
+        # a teacher that rules actions out may be pulled to, at an infinite divergence, but none is at NaN
+        check_advice(torch.where(kl.isnan(), kl, used.detach()), prior_dist, dist)
         ndim = tensordict.ndim or entropy.ndim  # what dispatch makes has no batch size
         found["prior_kl"], found[STUDENT_CROSS_ENTROPY] = joint(kl, ndim), joint(entropy, ndim)
         found["prior_cross_entropy"] = joint(pull, ndim)
         if loss.spec.auxiliary:
             found["loss_prior"] = found["prior_cross_entropy"]
+
+    def _student_dist(self, tensordict: TensorDictBase) -> d.Distribution:
+        try:
+            with self.loss.params_of("actor_network"):
+                return self.loss.actor_network.get_dist(tensordict.copy())
+        except ValueError as error:
+            raise ValueError(f"The student's distribution can not be built: {error}") from error
 
     def _prior_dist(self, tensordict: TensorDictBase) -> d.Distribution:
         prior = self.loss.prior

@@ -16,8 +16,10 @@ from tensordict.nn import (
 from tensordict.nn.distributions import Delta as TensorDictDelta
 from torch import Tensor
 from torch import distributions as d
+from torch.compiler import is_compiling
 from torchrl.modules import Delta
 
+from torchrl_priors.advice import parameter_fault
 from torchrl_priors.priors.prior import Prior
 
 __all__ = ["ActionPrior", "policy_of"]
@@ -77,13 +79,19 @@ class ActionPrior(Prior):
         if isinstance(self.module, ProbabilisticTensorDictSequential):
             private = self.module.get_dist_params(private)
         keys = _distribution_module(self.module).in_keys
-        return dict(zip(self.param_names, (private.get(key) for key in keys), strict=True))
+        params = dict(zip(self.param_names, (private.get(key) for key in keys), strict=True))
+        if not is_compiling() and (fault := parameter_fault(params)):
+            raise ValueError(f"The parameters of the {type(self).__name__} give no distribution: {fault}.")
+        return params
 
     def build_dist(self, params: dict[str, Tensor]) -> d.Distribution:
         """The policy's distribution with these parameters."""
         last = _distribution_module(self.module)
         values = TensorDict(dict(zip(last.in_keys, (params[name] for name in self.param_names), strict=True)))
-        return last.get_dist(values)
+        try:
+            return last.get_dist(values)
+        except ValueError as error:
+            raise ValueError(f"The parameters of the {type(self).__name__} give no distribution: {error}") from error
 
 
 def policy_of(
