@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, TypeGuard
 
 import torch
+from tensordict.nn import CompositeDistribution
 from tensordict.nn.distributions import OneHotCategorical as TensorDictOneHotCategorical
 from torch import Tensor
 from torch import distributions as d
@@ -253,6 +254,8 @@ def _check(
     if num_samples is not None and num_samples < 1:
         raise ValueError(f"num_samples must be at least 1, got {num_samples}.")
     pair = f"the {whose[0]}'s {type(dist).__name__} and the {whose[1]}'s {type(prior_dist).__name__}"
+    if isinstance(dist, CompositeDistribution) or isinstance(prior_dist, CompositeDistribution):
+        raise NotImplementedError(f"Distributions over several actions at once are not supported, got {pair}.")
     if isinstance(dist, CATEGORICAL) and isinstance(prior_dist, CATEGORICAL):
         shape, prior_shape = dist.logits.shape[-1:], prior_dist.logits.shape[-1:]
     else:

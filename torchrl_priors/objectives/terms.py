@@ -138,6 +138,12 @@ class RawCriticTerm(Term):
         reward, terminated = (read(tensordict, under_next(key), HINT) for key in (names.reward, names.terminated))
         with contextlib.nullcontext() if loss.trains_critic else torch.no_grad():
             value = loss.evaluate("critic_network", tensordict, names.value)
+        if not value.shape == reward.shape == terminated.shape:
+            raise ValueError(
+                f"The value of the critic_network, the reward {under_next(names.reward)!r} and"
+                f" {under_next(names.terminated)!r} must have one shape [*B, 1] (a value for each agent has no TD error"
+                f" here), got {tuple(value.shape)}, {tuple(reward.shape)} and {tuple(terminated.shape)}."
+            )
         with torch.no_grad():
             following = next_step(tensordict, loss.critic_network.in_keys, terminated)
             next_value = loss.evaluate("critic_network", following, names.value)

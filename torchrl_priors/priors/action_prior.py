@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,9 +18,10 @@ from tensordict.nn.distributions import Delta as TensorDictDelta
 from torch import Tensor
 from torch import distributions as d
 from torch.compiler import is_compiling
-from torchrl.modules import Delta
+from torchrl.modules import Delta, TanhDelta
 
 from torchrl_priors.advice import parameter_fault
+from torchrl_priors.distributions import without_independent
 from torchrl_priors.priors.prior import Prior
 
 __all__ = ["ActionPrior", "policy_of"]
@@ -89,9 +91,11 @@ class ActionPrior(Prior):
         last = _distribution_module(self.module)
         values = TensorDict(dict(zip(last.in_keys, (params[name] for name in self.param_names), strict=True)))
         try:
-            return last.get_dist(values)
+            dist = last.get_dist(values)
         except ValueError as error:
             raise ValueError(f"The parameters of the {type(self).__name__} give no distribution: {error}") from error
+        _check_kind(type(without_independent(dist)))  # the class may be known now only, e.g. a function's
+        return dist
 
 
 def policy_of(
@@ -118,11 +122,21 @@ def _distribution_module(module: TensorDictModuleBase) -> ProbabilisticTensorDic
         )
     last = [child for child in module.modules() if isinstance(child, ProbabilisticTensorDictModule)][-1]
     kind = last.distribution_class
-    if getattr(module, "return_composite", False) or kind is CompositeDistribution:
+    while isinstance(kind, partial):
+        kind = kind.func
+    if getattr(module, "return_composite", False):
+        kind = CompositeDistribution
+    if isinstance(kind, type):
+        _check_kind(kind)
+    return last
+
+
+def _check_kind(kind: type) -> None:
+    """Refuses a class of distributions that can't advise."""
+    if issubclass(kind, CompositeDistribution):
         raise NotImplementedError("Priors over several actions at once (CompositeDistribution) are not supported.")
-    if isinstance(kind, type) and issubclass(kind, (Delta, TensorDictDelta)):
+    if issubclass(kind, (Delta, TanhDelta, TensorDictDelta)):
         raise ValueError(
             f"A {kind.__name__} policy is deterministic: its log-probability can't advise. Give it a distribution,"
             " e.g. a Normal around its action."
         )
-    return last
