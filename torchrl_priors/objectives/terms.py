@@ -27,6 +27,7 @@ Found = dict[str, Tensor]
 #: The student's H^X(pi || pi0), where the auxiliary loss may be another one.
 STUDENT_CROSS_ENTROPY = "student_cross_entropy"
 HINT = "run PriorLogProb on it before the loss, or rename it by set_keys"
+OF_ENVIRONMENT = "an environment writes it, or rename it by set_keys"
 
 
 class Term(ABC):
@@ -135,7 +136,9 @@ class RawCriticTerm(Term):
     def __call__(self, tensordict: TensorDictBase, found: Found, dist: d.Distribution | None) -> None:
         """The TD error has no gradient."""
         loss, names = self.loss, self.loss.tensor_keys
-        reward, terminated = (read(tensordict, under_next(key), HINT) for key in (names.reward, names.terminated))
+        reward, terminated = (
+            read(tensordict, under_next(key), OF_ENVIRONMENT) for key in (names.reward, names.terminated)
+        )
         with contextlib.nullcontext() if loss.trains_critic else torch.no_grad():
             value = loss.evaluate("critic_network", tensordict, names.value)
         if not value.shape == reward.shape == terminated.shape:
@@ -214,7 +217,7 @@ class WeightTerm(Term):
 
     def _regress_at_the_next_state(self, tensordict: TensorDictBase, found: Found) -> None:
         loss, names = self.loss, self.loss.tensor_keys
-        terminated = read(tensordict, under_next(names.terminated), HINT)
+        terminated = read(tensordict, under_next(names.terminated), OF_ENVIRONMENT)
         signal = prior_bonus(loss.bonus_coeff, read(tensordict, under_next(names.prior_log_prob), HINT))
         signal = torch.where(terminated, torch.zeros_like(signal), signal)
         weight = self._weight(next_step(tensordict, loss.prior_weight.in_keys, terminated))

@@ -79,12 +79,27 @@ class ActionPrior(Prior):
         # The policy writes into a tensordict of its own, so that no key of the student is touched.
         private = tensordict.select(*self.in_keys)
         if isinstance(self.module, ProbabilisticTensorDictSequential):
-            private = self.module.get_dist_params(private)
+            try:
+                private = self.module.get_dist_params(private)
+            except RuntimeError as error:
+                self._explain(tensordict, error)
+                raise
         keys = _distribution_module(self.module).in_keys
         params = dict(zip(self.param_names, (private.get(key) for key in keys), strict=True))
         if not is_compiling() and (fault := parameter_fault(params)):
             raise ValueError(f"The parameters of the {type(self).__name__} give no distribution: {fault}.")
         return params
+
+    def _explain(self, tensordict: TensorDictBase, error: RuntimeError) -> None:
+        """Says it where a teacher can't read what it was given, as observations are of another precision."""
+        own = {p.dtype for p in self.module.parameters() if p.is_floating_point()}
+        given = {key: tensordict.get(key).dtype for key in self.in_keys}
+        other = {key: dtype for key, dtype in given.items() if dtype.is_floating_point and dtype not in own}
+        if own and other:
+            raise TypeError(
+                f"The teacher computes in {', '.join(map(str, own))}, and got {other}: convert the observations, e.g."
+                " with the transform DoubleToFloat, or the teacher, prior.to(torch.float64)."
+            ) from error
 
     def build_dist(self, params: dict[str, Tensor]) -> d.Distribution:
         """The policy's distribution with these parameters."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch import distributions as d
 from torch.compiler import is_compiling
 
-from torchrl_priors.distributions import TORCHRL_ONE_HOT, BoxUniform, action_shape, bounds_of, outside
+from torchrl_priors.distributions import CATEGORICAL, TORCHRL_ONE_HOT, BoxUniform, action_shape, bounds_of, outside
 
 __all__ = ["NegatedPrior", "Prior", "PriorWrapper"]
 
@@ -137,9 +137,15 @@ class Prior(TensorDictModuleBase, ABC):
         differs = f"The action space of the prior differs from the student's: {self.action_key!r}"
         expected = action_shape(dist)
         if action.shape != expected:
+            hint = ""
+            if isinstance(dist, CATEGORICAL) and abs(action.ndim - len(expected)) == 1:
+                hint = (
+                    " One of the two is one-hot, and the other an index: see one_hot=True of load_sb3_prior, or"
+                    " distribution_class=OneHotCategorical of a teacher of your own."
+                )
             raise ValueError(
                 f"{differs} is of shape {tuple(action.shape)}, and the prior's {type(dist).__name__} is over actions of"
-                f" shape {tuple(expected)} (batch {tuple(tensordict.batch_size)})."
+                f" shape {tuple(expected)} (batch {tuple(tensordict.batch_size)}).{hint}"
             )
         if not is_compiling():
             self._check_values(action, dist, differs)
