@@ -144,6 +144,11 @@ class PriorBonus(BatchTransform):
         terminated = None
         if self.shift == "next":
             terminated = read(tensordict, self.terminated_key, "there is no bonus after an end")
+            if terminated.shape != log_prob.shape:
+                raise ValueError(
+                    f"Expected {self.terminated_key!r} of the shape of {self.log_prob_key!r}, {tuple(log_prob.shape)},"
+                    f" got {tuple(terminated.shape)}."
+                )
         weight = torch.ones_like(log_prob)
         module: PriorWeight | None = self.__dict__["prior_weight"]
         if module is not None:
