@@ -22,7 +22,7 @@ from torchrl_priors.artifacts import ArtifactError, read_manifest
 from torchrl_priors.artifacts.format import _NO_DIGEST, KIND, _seal, pack
 from torchrl_priors.collectors import RunningNorm
 from torchrl_priors.networks import make_actor
-from torchrl_priors.priors.layers import GaussianHead, StateIndependentStd, TeacherInput
+from torchrl_priors.priors.layers import ClipToBox, GaussianHead, StateIndependentStd, TeacherInput
 
 
 @pytest.fixture
@@ -199,6 +199,10 @@ def linear() -> Any:
     return gaussian(TeacherInput((OBS,), statistics=(torch.zeros(OBS),) * 2), GaussianHead(OBS, 2))
 
 
+def clipped() -> Any:
+    return gaussian(nn.Linear(OBS, 2), ClipToBox(torch.zeros(2), torch.ones(2)), StateIndependentStd(torch.zeros(2)))
+
+
 SQUASHED, TABLE, UNIFORM = (STORABLE[name] for name in ("squashed", "table", "uniform"))
 FORGED = [
     (policy, tell(prior="pickle"), "its kind of prior is unknown: 'pickle'"),
@@ -242,6 +246,7 @@ FORGED = [
     (policy, put(f"{NETWORK}0.count", -1.0, torch.float64), "negative count"),
     (policy, put(f"{NETWORK}0.mean", [1e300] * OBS, torch.float64), "statistics of its observations overflow"),
     (own_std, put(f"{NETWORK}1.log_std", [0.0, 1000.0]), "exponentials of log_std, overflow or vanish"),
+    (clipped, put(f"{NETWORK}1.low", [0.0, 1.5]), "lower bounds of its actions are above the upper ones"),
     (linear, put(f"{NETWORK}0.var", [-1.0] * OBS, torch.float64), "negative variance"),
     *(
         (linear, layer(1, log_std_range=list(values)), "log_std_range of a layer 'gaussian_head' must be a lower and")

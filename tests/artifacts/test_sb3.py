@@ -20,7 +20,8 @@ from gymnasium import spaces
 from hydra import compose, initialize_config_dir
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sb3_cases import BOX, MODELS, PPO, DummyVecEnv, Model, Noise, Saved, VecNormalize, save_model
+from sb3_cases import BOX, MODELS, PPO, STD, DummyVecEnv, Model, Noise, Saved, VecFrameStack, VecNormalize, save_model
+from sb3_corpus import Stands
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import OneHot
@@ -28,7 +29,7 @@ from torchrl.data import OneHot
 from recipes.export_sb3 import export
 from torchrl_priors.artifacts import ArtifactError, load_prior, load_sb3_prior, save_prior
 from torchrl_priors.artifacts.sb3_files import read_vecnormalize
-from torchrl_priors.priors import ModulePrior
+from torchrl_priors.priors import BoltzmannPrior, ModulePrior
 
 CONF = Path(__file__).parents[2] / "conf"
 NUMBER = 1000
@@ -55,8 +56,8 @@ def observations(case: Model, number: int = NUMBER) -> np.ndarray:
     return rng.normal(size=(number, 3)) * np.array([0.1, 1.0, 30.0]) + 2
 
 
-def convert(model: Saved, name: str) -> ModulePrior:
-    return load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.1 if name == "td3" else None)
+def convert(model: Saved, name: str, **kwargs: Any) -> ModulePrior | BoltzmannPrior:
+    return load_sb3_prior(model.path, vecnormalize=model.vecnormalize, **MODELS[name].told, **kwargs)
 
 
 def batch_of(raw: np.ndarray) -> TensorDict:
@@ -76,8 +77,7 @@ class TestConversion:
         dist = convert(model, name).get_dist(batch_of(raw))
         if expected.is_floating_point():
             action = dist.deterministic_sample if name == "sac" else dist.mean
-            low, high = torch.as_tensor(BOX.low), torch.as_tensor(BOX.high)
-            torch.testing.assert_close(torch.minimum(torch.maximum(action, low), high), expected, **TOLERANCE)
+            torch.testing.assert_close(action, expected, **TOLERANCE)
             assert expected.std(0).min() > 0.01  # not all at a bound
         else:
             assert torch.equal(dist.probs.argmax(-1), expected)
@@ -88,10 +88,10 @@ class TestConversion:
         seen = model.env.normalize_obs(raw) if model.vecnormalize else raw
         policy = model.model.policy
         tensor = policy.obs_to_tensor(seen)[0]
-        prior, batch = convert(model, name), batch_of(raw)
+        prior, batch = convert(model, name, clip_mean=False), batch_of(raw)
         with torch.no_grad():
-            if name == "td3":
-                pytest.skip("TD3 has no distribution of its own")
+            if MODELS[name].told == STD:
+                pytest.skip("it has no distribution of its own, or none that is read")
             if name == "sac":
                 # in float64, as the inverse of tanh amplifies rounding
                 mean, log_std, _ = policy.actor.get_action_dist_params(tensor)
@@ -106,12 +106,17 @@ class TestConversion:
                 batch["action"] = low + 0.5 * (scaled + 1) * (high - low)
                 params = {key: value.double() for key, value in prior.get_params(batch).items()}
                 found = prior.log_prob(batch, dist=prior.build_dist(params))
+            elif name.startswith("dqn"):
+                values = policy.q_net(tensor)
+                batch["action"] = values.argmin(-1)
+                expected = (values / 0.5).log_softmax(-1).min(-1).values
+                found = prior.log_prob(batch)
             else:
                 dist = policy.get_distribution(tensor)
                 batch["action"] = dist.get_actions()
                 expected = dist.log_prob(batch["action"])
                 found = prior.log_prob(batch)
-        torch.testing.assert_close(found, expected, **TOLERANCE)
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-6)
 
     def test_round_trip_through_a_file(self, saved: Callable[[str], Saved], name: str, tmp_path: Path) -> None:
         prior, batch = convert(saved(name), name), batch_of(observations(MODELS[name], 20))
@@ -149,6 +154,33 @@ class TestConversion:
         normal = load_sb3_prior(model.path, vecnormalize=model.vecnormalize, std=0.3).get_dist(batch)
         torch.testing.assert_close(normal.mean, squashed.deterministic_sample, **TOLERANCE)
         assert (normal.stddev == 0.3).all()
+
+    @pytest.mark.parametrize("std", [None, 0.3])
+    def test_the_mean_stays_within_the_bounds_unless_it_shall_be_raw(
+        self, saved: Callable[[str], Saved], std: float | None, tmp_path: Path
+    ) -> None:
+        batch, low, high = batch_of(observations(MODELS["a2c"])), torch.as_tensor(BOX.low), torch.as_tensor(BOX.high)
+        clipped, raw = (load_sb3_prior(saved("a2c").path, std=std, clip_mean=clip) for clip in (True, False))
+        mean = raw.get_dist(batch).mean
+        assert (mean > high).any()
+        assert (mean < low).any()
+        save_prior(tmp_path / "teacher", clipped, env_id="Noise-v0")
+        for prior in (clipped, load_prior(tmp_path / "teacher")):
+            assert torch.equal(prior.get_dist(batch).mean, mean.clamp(low, high))
+            assert torch.equal(prior.get_dist(batch).stddev, raw.get_dist(batch).stddev)
+
+    @pytest.mark.parametrize(("low", "high"), [(-np.inf, np.inf), (-np.inf, 0.2)])
+    def test_actions_without_a_bound_are_not_clipped_there(
+        self, saved: Callable[[str], Saved], tmp_path: Path, low: float, high: float
+    ) -> None:
+        space = base64.b64encode(pickle.dumps(spaces.Box(low, high, (2,)))).decode()
+        change = {"action_space": {":serialized:": space}}
+        path = rewrite(saved("a2c").path, tmp_path / "model.zip", data=lambda data: {**data, **change})
+        batch = batch_of(observations(MODELS["a2c"]))
+        found, raw = (load_sb3_prior(path, clip_mean=clip) for clip in (True, False))
+        mean = raw.get_dist(batch).mean
+        assert mean.max() > 0.2
+        assert torch.equal(found.get_dist(batch).mean, mean.clamp(low, high))
 
     def test_discrete_advice_can_be_one_hot(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
         path, batch = saved("ppo_discrete").path, batch_of(observations(MODELS["ppo_discrete"], 20))
@@ -192,6 +224,105 @@ class TestConversion:
         ] == pytest.approx(0.1)
 
 
+class TestRelatives:
+    """Files of algorithms and releases that are not installed, written by hand."""
+
+    def test_tqc_and_trpo_have_the_actors_of_sac_and_ppo(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        for name, module in (("sac", "tqc"), ("ppo", "trpo")):
+            path = rewrite(
+                saved(name).path, tmp_path / f"{module}.zip", data=of_module(f"sb3_contrib.{module}.policies")
+            )
+            batch = batch_of(observations(MODELS[name], 20))
+            for std in (None, 0.1):
+                found, expected = (load_sb3_prior(file, std=std).get_params(batch) for file in (path, saved(name).path))
+                assert all(torch.equal(found[key], expected[key]) for key in expected)
+
+    def test_qr_dqn_has_the_mean_of_its_quantiles(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        weight, bias = torch.randn(6 * 4, 8), torch.randn(6 * 4)
+        last = {"quantile_net.quantile_net.4.weight": weight, "quantile_net.quantile_net.4.bias": bias}
+        path = rewrite(
+            saved("dqn").path,
+            tmp_path / "model.zip",
+            data=of_module("sb3_contrib.qrdqn.policies"),
+            weights=lambda w: {**renamed(w, "q_net", "quantile_net"), **last},
+        )
+        raw = observations(MODELS["dqn"], 20)
+        with torch.no_grad():
+            hidden = saved("dqn").model.policy.q_net.q_net[:-1](torch.as_tensor(raw).float())
+            values = nn.functional.linear(hidden, weight, bias).view(-1, 6, 4).mean(1)
+        prior = load_sb3_prior(path, temperature=2.0)
+        torch.testing.assert_close(prior.get_dist(batch_of(raw)).probs, (values / 2).softmax(-1))
+        broken = rewrite(path, tmp_path / "broken.zip", weights=lambda w: {**w, **{k: v[1:] for k, v in last.items()}})
+        with pytest.raises(ArtifactError, match=r"over \(23,\) actions, and its action space has 4"):
+            load_sb3_prior(broken, temperature=2.0)
+
+    @pytest.mark.parametrize("name", ["a2c", "ppo_image"])
+    def test_weights_of_before_pytorch_1_6(self, saved: Callable[[str], Saved], tmp_path: Path, name: str) -> None:
+        def strided(weights: dict[str, Any]) -> dict[str, Any]:
+            """Views of one memory that do not begin where it does."""
+            first, bias = weights["action_net.weight"], weights["action_net.bias"]
+            memory = torch.cat([bias, first.t().flatten()])
+            weights["action_net.bias"] = memory[: len(bias)]
+            weights["action_net.weight"] = memory[len(bias) :].view(*first.t().shape).t()
+            return weights
+
+        for change in (lambda weights: weights, strided):
+            path = rewrite(saved(name).path, tmp_path / "model.zip", weights=change, legacy=True)
+            batch = batch_of(observations(MODELS[name], 20))
+            found, expected = (load_sb3_prior(file) for file in (path, saved(name).path))
+            for key, value in expected.state_dict().items():
+                assert torch.equal(found.state_dict()[key], value)
+            torch.testing.assert_close(found.get_params(batch), expected.get_params(batch))
+
+    def test_a_stack_of_normalised_frames_is_named(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        env = VecFrameStack(saved("ppo").env, 4)
+        PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8).save(tmp_path / "model.zip")
+        with pytest.raises(ArtifactError, match=r"reads \(12,\).* VecFrameStack over VecNormalize.* CallablePrior"):
+            load_sb3_prior(tmp_path / "model.zip", vecnormalize=saved("ppo").vecnormalize)
+
+    def test_stable_baselines_2_is_named(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        with zipfile.ZipFile(tmp_path / "zipped.zip", "w") as archive:
+            for name in ("data", "parameters", "parameter_list"):
+                archive.writestr(name, "{}")
+        (tmp_path / "pickled.pkl").write_bytes(Stands("stable_baselines.common.policies.MlpPolicy", {}).dump())
+        for name in ("zipped.zip", "pickled.pkl"):
+            with pytest.raises(ArtifactError, match=rf"{name} .* of Stable-Baselines 2, .* CallablePrior"):
+                load_sb3_prior(tmp_path / name)
+        name = "stable_baselines.common.vec_env.vec_normalize.VecNormalize"
+        (tmp_path / "vec.pkl").write_bytes(Stands(name, {}).dump())
+        with pytest.raises(ArtifactError, match=r"vec\.pkl .* of Stable-Baselines 2"):
+            read_vecnormalize(tmp_path / "vec.pkl")
+
+    @pytest.mark.parametrize(
+        ("change", "match"),
+        [
+            ({"policy_kwargs": {"clip_mean": "2"}}, "clip_mean must be a number"),
+            ({"policy_kwargs": {"clip_mean": float("inf")}}, "clip_mean must be a number"),
+            ({"policy_kwargs": {"clip_mean": 0}}, "lacks actor.mu.weight"),
+        ],
+    )
+    def test_damaged_state_dependent_noise(
+        self, saved: Callable[[str], Saved], tmp_path: Path, change: dict[str, Any], match: str
+    ) -> None:
+        path = rewrite(saved("sac_sde").path, tmp_path / "model.zip", data=lambda data: {**data, **change})
+        with pytest.raises(ArtifactError, match=match):
+            load_sb3_prior(path, std=0.1)
+
+    def test_weights_and_actions_of_different_kinds(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
+        for name, other in (("dqn", "sac"), ("sac", "dqn")):
+            with zipfile.ZipFile(saved(other).path) as archive:
+                space = json.loads(archive.read("data"))["action_space"]
+            path = rewrite(
+                saved(name).path, tmp_path / "model.zip", data=lambda data, space=space: {**data, "action_space": space}
+            )
+            with pytest.raises(ArtifactError, match="its weights are not of actions of a"):
+                load_sb3_prior(path)
+
+
+def of_module(name: str) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    return lambda data: {**data, "policy_class": {**data["policy_class"], "__module__": name}}
+
+
 class MyPolicy(PPO.policy_aliases["MlpPolicy"]):
     pass
 
@@ -200,12 +331,22 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("env", "policy", "kwargs", "match"),
         [
-            ({}, "MlpPolicy", {"use_sde": True}, "use_sde=True"),
+            ({}, "MlpPolicy", {"use_sde": True}, r"use_sde=True\): pass std"),
             ({"actions": spaces.MultiDiscrete([2, 3])}, "MlpPolicy", {}, "actions are a MultiDiscrete space"),
             ({"actions": spaces.MultiBinary(2)}, "MlpPolicy", {}, "actions are a MultiBinary space"),
             ({"observations": spaces.Discrete(3)}, "MlpPolicy", {}, "observations are a Discrete space"),
-            ({"observations": spaces.Dict(a=BOX)}, "MultiInputPolicy", {}, "observations are a Dict space"),
-            ({}, MyPolicy, {}, "policy class is one of test_sb3, and only those of PPO, A2C, SAC and TD3"),
+            (
+                {"observations": spaces.Dict(a=BOX)},
+                "MultiInputPolicy",
+                {},
+                r"observations are a Dict space.* CallablePrior\(lambda a, b: model.predict\({\"a\": a",
+            ),
+            (
+                {},
+                MyPolicy,
+                {},
+                r"policy class is one of test_sb3, and only those of PPO, .* CallablePrior\(lambda o: model.predict",
+            ),
             ({}, "MlpPolicy", {"policy_kwargs": {"activation_fn": nn.Hardtanh}}, "Hardtanh"),
         ],
     )
@@ -220,6 +361,12 @@ class TestRefusals:
     def test_what_contradicts_the_file(self, saved: Callable[[str], Saved]) -> None:
         with pytest.raises(ValueError, match="pass std"):
             load_sb3_prior(saved("td3").path)
+        with pytest.raises(ValueError, match="pass temperature"):
+            load_sb3_prior(saved("dqn").path)
+        with pytest.raises(ValueError, match=r"temperature=1\.0 is of no use"):
+            load_sb3_prior(saved("ppo").path, temperature=1.0)
+        with pytest.raises(ValueError, match="discrete actions"):
+            load_sb3_prior(saved("dqn").path, std=0.1, temperature=1.0)
         with pytest.raises(ValueError, match="discrete actions"):
             load_sb3_prior(saved("ppo_discrete").path, std=0.1)
         with pytest.raises(ValueError, match="contradicts the file, whose policy has 'elu'"):
@@ -256,9 +403,9 @@ class TestRefusals:
 
     def test_another_algorithm_is_named(self, saved: Callable[[str], Saved], tmp_path: Path) -> None:
         def rename(data: dict[str, Any]) -> dict[str, Any]:
-            return {**data, "policy_class": {**data["policy_class"], "__module__": "stable_baselines3.dqn.policies"}}
+            return {**data, "policy_class": {**data["policy_class"], "__module__": "sb3_contrib.ars.policies"}}
 
-        with pytest.raises(ArtifactError, match=r"is one of stable_baselines3\.dqn\.policies, and only those of PPO"):
+        with pytest.raises(ArtifactError, match=r"is one of sb3_contrib\.ars\.policies, and only those of PPO"):
             load_sb3_prior(rewrite(saved("a2c").path, tmp_path / "model.zip", data=rename))
 
 
@@ -267,7 +414,12 @@ def renamed(weights: dict[str, Any], old: str, new: str) -> dict[str, Any]:
 
 
 def rewrite(
-    source: Path, target: Path, *, weights: Callable[[Any], Any] = lambda w: w, data: Callable[[Any], Any] = lambda d: d
+    source: Path,
+    target: Path,
+    *,
+    weights: Callable[[Any], Any] = lambda w: w,
+    data: Callable[[Any], Any] = lambda d: d,
+    legacy: bool = False,
 ) -> Path:
     """A copy of a model with other content."""
     with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as out:
@@ -275,7 +427,8 @@ def rewrite(
             content = archive.read(name)
             if name == "policy.pth":
                 buffer = io.BytesIO()
-                torch.save(weights(torch.load(io.BytesIO(content), weights_only=True)), buffer)
+                changed = weights(torch.load(io.BytesIO(content), weights_only=True))
+                torch.save(changed, buffer, _use_new_zipfile_serialization=not legacy)
                 content = buffer.getvalue()
             if name == "data":
                 content = json.dumps(data(json.loads(content))).encode()

@@ -29,7 +29,14 @@ from torchrl_priors import (
 from torchrl_priors.artifacts import ArtifactError, read_manifest
 from torchrl_priors.collectors import RunningNorm
 from torchrl_priors.networks import make_actor
-from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
+from torchrl_priors.priors.layers import (
+    ClipToBox,
+    GaussianHead,
+    NatureCNN,
+    ScaleToBox,
+    StateIndependentStd,
+    TeacherInput,
+)
 
 OBS, ACTIONS = 4, 3
 NETWORK = "prior.network."
@@ -88,6 +95,9 @@ STORABLE: dict[str, Callable[[], ActionPrior]] = {
     ),
     "boxed": lambda: ModulePrior(
         nn.Sequential(net(), nn.Tanh(), ScaleToBox(-torch.ones(ACTIONS), torch.ones(ACTIONS))), "mean", std=0.2
+    ),
+    "clipped": lambda: gaussian(
+        net(), ClipToBox(torch.zeros(3), torch.tensor([1.0, 2.0, torch.inf])), StateIndependentStd(torch.zeros(3))
     ),
     "own_std": lambda: gaussian(normalised(clip=3), net(), StateIndependentStd(torch.randn(ACTIONS))),
     "head": lambda: gaussian(normalised(eps=0.1), GaussianHead(OBS, ACTIONS, log_std_range=(-3, 1.5))),

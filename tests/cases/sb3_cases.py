@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -14,8 +15,8 @@ from torch import nn
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")
-    from stable_baselines3 import A2C, PPO, SAC, TD3
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+    from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize  # noqa: F401
 
 BOX = spaces.Box(np.array([-2.0, 0.125], np.float32), np.array([2.0, 0.75], np.float32))
 VECTOR = spaces.Box(-np.inf, np.inf, (3,), np.float64)
@@ -48,11 +49,13 @@ class Model(NamedTuple):
     observations: spaces.Space = VECTOR
     actions: spaces.Space = BOX
     normalize: bool = False
+    told: Any = MappingProxyType({})  # what its prior needs to be told
 
 
 A2C_STEPS = {"n_steps": 16}
 PPO_STEPS = {"n_steps": 16, "batch_size": 8}
 OFF_POLICY = {"buffer_size": 64, "learning_starts": 8, "batch_size": 8}
+STD, VALUES = {"std": 0.1}, {"temperature": 0.5}
 DEEP = {"net_arch": {"pi": [8, 4, 6], "vf": [5]}, "activation_fn": nn.ELU}
 MODELS = {
     "ppo": Model(PPO, PPO_STEPS, {}, normalize=True),
@@ -61,7 +64,16 @@ MODELS = {
     "a2c": Model(A2C, A2C_STEPS, DEEP),
     "a2c_linear": Model(A2C, A2C_STEPS, {"net_arch": []}, actions=spaces.Discrete(3), normalize=True),
     "sac": Model(SAC, OFF_POLICY, {"net_arch": [8, 8]}, normalize=True),
-    "td3": Model(TD3, OFF_POLICY, {"net_arch": [8, 8], "activation_fn": nn.Tanh}, normalize=True),
+    "td3": Model(TD3, OFF_POLICY, {"net_arch": [8, 8], "activation_fn": nn.Tanh}, normalize=True, told=STD),
+    "ddpg": Model(DDPG, OFF_POLICY, {"net_arch": [8, 8]}, told=STD),
+    "dqn": Model(DQN, OFF_POLICY, {"net_arch": [8, 8]}, actions=spaces.Discrete(4), normalize=True, told=VALUES),
+    "dqn_image": Model(
+        DQN, OFF_POLICY, {"features_extractor_kwargs": {"features_dim": 16}}, IMAGE, spaces.Discrete(4), told=VALUES
+    ),
+    "ppo_sde": Model(PPO, {**PPO_STEPS, "use_sde": True}, {}, normalize=True, told=STD),
+    "a2c_sde_squashed": Model(A2C, {**A2C_STEPS, "use_sde": True}, {"squash_output": True}, told=STD),
+    "sac_sde": Model(SAC, {**OFF_POLICY, "use_sde": True}, {"net_arch": [8, 8]}, normalize=True, told=STD),
+    "sac_sde_raw": Model(SAC, {**OFF_POLICY, "use_sde": True}, {"net_arch": [8], "clip_mean": 0.0}, told=STD),
 }
 
 

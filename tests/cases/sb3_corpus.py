@@ -7,6 +7,7 @@ import io
 import json
 import math
 import pickle
+import pickletools
 import random
 import zipfile
 from collections.abc import Iterator
@@ -78,10 +79,38 @@ def weights(good: dict[str, torch.Tensor]) -> Iterator[tuple[str, bytes]]:
     data = saved(good)
     for label, program in (("deep", DEEP), ("twice", TWICE), ("many", MANY)):
         yield label, rezipped(data, lambda member, content, p=program: p if member.endswith("data.pkl") else content)
+    yield from legacy(good)
     packed = saved({**good, "value_net.bias": torch.zeros(1 << 21)})
     yield "packed", rezipped(packed, lambda member, content: content, zipfile.ZIP_DEFLATED)
     # a number of entries that the record lacks
     yield "claims more", rezipped(data, lambda member, content: content[:-4] if "/data/" in member else content)
+
+
+def legacy(good: dict[str, torch.Tensor]) -> Iterator[tuple[str, bytes]]:
+    """The same in the format before PyTorch 1.6, whose pickles say how large memory is."""
+
+    def old(value: Any) -> bytes:
+        buffer = io.BytesIO()
+        torch.save(value, buffer, _use_new_zipfile_serialization=False)
+        return buffer.getvalue()
+
+    data = old(good)
+    file = io.BytesIO(data)
+    # of the pickles of a number, a version, the machine, the object, and the names of its memory
+    ends = [len(list(pickletools.genops(file))) and file.tell() for _ in range(5)]
+    start = data[: ends[2]]
+    yield "legacy bomb", old({**good, "x": Bomb()})
+    yield "legacy expanded", old({**good, "action_net.weight": torch.zeros(1).expand(1 << 16, 1 << 20)})
+    yield "legacy list", old(list(good.values()))
+    yield "legacy then zip", start + saved(good)
+    for length in range(0, len(data), max(1, len(data) // 40)):
+        yield "legacy truncated", data[:length]
+    nested = b"ctorch._utils\n_rebuild_tensor_v2\n("
+    nested = START + b"}" + 10_000 * nested + b"K\x01" + 10_000 * b"K\x01K\x01K\x01K\x01K\x01tR" + b"K\x01s."
+    for program in (DEEP, TWICE, MANY, nested, pickle.dumps(Bomb()), pickle.dumps({"a": 1}), pickle.dumps(3)):
+        yield "legacy program", start + program + pickle.dumps([])
+    for number in (-1, 1 << 40, 1 << 62):  # that the first memory claims to have
+        yield "legacy claims more", data[: ends[4]] + number.to_bytes(8, "little", signed=True) + data[ends[4] + 8 :]
 
 
 def statistics(good: bytes) -> Iterator[tuple[str, bytes]]:

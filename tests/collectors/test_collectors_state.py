@@ -123,7 +123,7 @@ class TestContinuing:
     def test_another_process_continues_to_the_bit(self, tmp_path: Path) -> None:
         script = f"""
 import sys, torch
-sys.path.insert(0, {str(Path(__file__).parents[1] / "cases")!r})
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1] / "cases")]!r}
 torch.set_num_threads(1)
 from test_collectors_state import collector
 torch.manual_seed(0)

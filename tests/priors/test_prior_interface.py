@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from typing import Any
 
@@ -67,6 +68,21 @@ def test_plays_the_actions_of_its_distribution_and_writes_nothing_else(name: str
         copy.deepcopy(policy), pickle.loads(pickle.dumps(policy)),
     ):  # fmt: skip
         assert twin(batch.clone())["action"].shape == sampled["action"].shape
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (2, 0), (2, 3)])
+@pytest.mark.parametrize("name", PRIORS)
+def test_advises_on_a_batch_of_any_size(name: str, shape: tuple[int, ...]) -> None:
+    teacher, flat = PRIORS[name](), states(max(1, math.prod(shape)))
+    batch = flat[: math.prod(shape)].reshape(shape)
+    params, expected = teacher.get_params(batch), teacher.get_params(flat)
+    for key, value in params.items():
+        assert value.shape == (*shape, *expected[key].shape[1:])
+        if 0 not in shape and name != "random":
+            torch.testing.assert_close(value.reshape_as(expected[key]), expected[key])
+    played = teacher.policy()(batch)
+    if 0 not in shape:  # torch's Independent has no log-probability of no action
+        assert teacher.log_prob(played).shape == shape
 
 
 def test_samples_or_takes_the_mode_by_the_exploration_type() -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
+from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import distributions as d
 from torch import nn
+from torchrl.envs import GymEnv
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
 from torchrl_priors import (
@@ -109,6 +113,33 @@ class TestModulePrior:
         inverse = 1 / prior.get_dist(batch).probs
         torch.testing.assert_close(prior.adversary().get_dist(batch).probs, inverse / inverse.sum(-1, keepdim=True))
 
+    @pytest.mark.parametrize("kind", ["script", "trace", "freeze", "file", "pair"])
+    def test_a_policy_of_torchscript(self, kind: str, tmp_path: Path) -> None:
+        net: nn.Module = (
+            Pair() if kind == "pair" else nn.Sequential(nn.Linear(OBS, 8), nn.Dropout(), nn.Linear(8, ACTIONS))
+        )
+        eager = net.eval() if kind in ("trace", "freeze", "pair") else net
+        policy = torch.jit.trace(eager, torch.zeros(1, OBS)) if kind in ("trace", "pair") else torch.jit.script(eager)
+        if kind == "freeze":
+            policy = torch.jit.freeze(policy)
+        if kind == "file":
+            torch.jit.save(policy, tmp_path / "policy.pt")
+            policy = torch.jit.load(tmp_path / "policy.pt")
+        told: dict[str, Any] = {"output": "mean_std"} if kind == "pair" else {"output": "mean", "std": 0.5}
+        prior, expected = ModulePrior(policy, **told), ModulePrior(net, **told)
+        batch = observations(2, 3)
+        before = expected.get_dist(batch).mean
+        for twin in (prior, deepcopy(prior), ModulePrior(policy, **told)):
+            torch.testing.assert_close(twin.get_dist(batch).mean, before)  # without dropout
+            assert not any(parameter.requires_grad for parameter in twin.parameters())
+        if kind != "freeze":
+            with torch.no_grad():
+                next(policy.parameters()).add_(1)
+            torch.testing.assert_close(prior.get_dist(batch).mean, before)
+            assert all(parameter.requires_grad for parameter in policy.parameters())
+        batch["action"] = torch.zeros(2, 3, ACTIONS)
+        torch.testing.assert_close(prior.log_prob(batch), expected.log_prob(batch))
+
     def test_bad_input_is_refused(self) -> None:
         net = nn.Linear(OBS, ACTIONS)
         for error, match, make in (
@@ -144,6 +175,54 @@ class TestCallablePrior:
         before = batch["observation"].clone()
         CallablePrior(bot, num_actions=ACTIONS, epsilon=0.1).get_dist(batch)
         assert torch.equal(batch["observation"], before)
+
+    def test_a_method_of_what_cannot_be_copied(self) -> None:
+        class Bot:
+            def __init__(self) -> None:
+                self.handle, self.gain = threading.Lock(), 2.0
+
+            def act(self, observation: np.ndarray) -> np.ndarray:
+                with self.handle:
+                    return self.gain * observation
+
+        prior = CallablePrior(Bot().act, std=1.0)
+        batch = observations(5)
+        for twin in (prior, deepcopy(prior), MixturePrior([prior, prior])):
+            torch.testing.assert_close(twin.get_dist(batch).mean, 2 * batch["observation"])
+
+    def test_what_predicts_a_pair(self) -> None:
+        class Model:
+            """As of Stable-Baselines3: what it predicts is sampled by default, and comes with a state."""
+
+            state: Any = None
+
+            def predict(
+                self, observation: np.ndarray, state: Any = None, deterministic: bool = False
+            ) -> tuple[np.ndarray, Any]:
+                noise = 0.0 if deterministic else 100.0
+                return observation[..., :2] + noise, self.state
+
+        model, batch = Model(), observations(5)
+        for batched in (False, True):
+            prior = CallablePrior(model.predict, std=1.0, batched=batched)
+            torch.testing.assert_close(prior.get_dist(batch).mean, batch["observation"][:, :2])
+        model.state = (np.zeros(3), np.zeros(3))
+        with pytest.raises(TypeError, match="it has a memory"):
+            prior.get_dist(batch)
+
+    def test_two_actions_are_not_taken_for_a_pair(self) -> None:
+        batch = observations(2)
+        for prior in (
+            CallablePrior(lambda x: (x[0], x[1]), std=1.0),
+            CallablePrior(lambda x: tuple(map(tuple, x[:, :2])), std=1.0, batched=True),
+        ):
+            torch.testing.assert_close(prior.get_dist(batch).mean, batch["observation"][:, :2])
+
+    def test_it_plays_in_an_environment_without_a_batch(self) -> None:
+        env = GymEnv("Pendulum-v1")
+        prior = CallablePrior(lambda x: -2.0 * x[1:2], std=0.1)
+        rollout = env.rollout(5, prior.policy())
+        torch.testing.assert_close(rollout["action"], -2.0 * rollout["observation"][:, 1:2])
 
     def test_one_by_one_and_batched_agree(self) -> None:
         batch = observations(2, 3)

@@ -14,7 +14,14 @@ from torchrl.modules import MLP
 from torchrl_priors.artifacts.errors import ArtifactError, differing, short
 from torchrl_priors.collectors.running_norm import RunningNorm
 from torchrl_priors.networks import ACTIVATIONS, GaussianMLP
-from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
+from torchrl_priors.priors.layers import (
+    ClipToBox,
+    GaussianHead,
+    NatureCNN,
+    ScaleToBox,
+    StateIndependentStd,
+    TeacherInput,
+)
 
 __all__ = ["build_network", "check_values", "describe_network"]
 
@@ -80,10 +87,12 @@ def check_values(network: nn.Module) -> None:
     """Refuses finite numbers that make what is not finite.
 
     Raises:
-        ArtifactError: statistics of observations have a negative variance or count, or overflow; or a standard
-            deviation overflows or vanishes.
+        ArtifactError: statistics of observations have a negative variance or count, or overflow; a standard deviation
+            overflows or vanishes; or the bounds of actions are in the wrong order.
     """
     for layer in network.modules():
+        if isinstance(layer, (ClipToBox, ScaleToBox)) and (layer.low > layer.high).any():
+            raise ArtifactError("the lower bounds of its actions are above the upper ones")
         if isinstance(layer, (TeacherInput, RunningNorm)) and layer.var is not None and (layer.var < 0).any():
             raise ArtifactError("the statistics of its observations have a negative variance")
         if isinstance(layer, RunningNorm):
@@ -214,6 +223,7 @@ def _log_std_range(value: Any) -> tuple[float, float]:
 
 
 _LAYERS: dict[str, tuple[type[nn.Module], dict[str, Callable[[Any], Any]]]] = {
+    "clip_to_box": (ClipToBox, {"low": _tensor, "high": _tensor}),
     "gaussian_head": (GaussianHead, {"features": _count, "act_dim": _count, "log_std_range": _log_std_range}),
     "gaussian_mlp": (
         GaussianMLP,

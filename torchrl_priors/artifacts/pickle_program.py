@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickletools
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from torchrl_priors.artifacts.errors import InertPickleError
 
@@ -21,14 +21,14 @@ class _Size(NamedTuple):
     entries: int = 1
 
 
-def check_program(data: bytes) -> None:
+def check_program(data: bytes | IO[bytes]) -> None:
     """Refuses a pickle that would crash or never end in the hands of an unpickler that runs nothing.
 
     The danger is in tuples, which are hashed when they are the key of a dictionary, at any depth and each time anew:
     nested by the thousand, or each with the one before it twice. Other objects are held to the number of steps.
 
     Args:
-        data (bytes): the pickle.
+        data (bytes or file): the pickle. A file is left where the pickle ends.
 
     Raises:
         InertPickleError: its program is too long, or has such tuples, or a memo with holes.

@@ -5,21 +5,26 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import OneHotCategorical, TanhNormal
 
-from torchrl_priors.artifacts.errors import ArtifactError, differing
-from torchrl_priors.artifacts.network import check_values
+from torchrl_priors.artifacts.errors import ArtifactError, short
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
+from torchrl_priors.artifacts.sb3_network import Family, action_bounds, build_layers, find_family
 from torchrl_priors.networks import ACTIVATIONS
-from torchrl_priors.priors import ModulePrior
-from torchrl_priors.priors.layers import GaussianHead, NatureCNN, ScaleToBox, StateIndependentStd, TeacherInput
+from torchrl_priors.priors import BoltzmannPrior, ModulePrior
 
 __all__ = ["load_sb3_prior"]
+
+_POLICIES = re.compile(
+    r"stable_baselines3\.(common|ppo|a2c|sac|td3|dqn)\.policies|sb3_contrib\.(tqc|trpo|qrdqn)\.policies"
+)
+_EXTRACTORS = re.compile(r"stable_baselines3\.common\.torch_layers\.(FlattenExtractor|NatureCNN)'")
+_ACTIVATIONS = {f"<class 'torch.nn.modules.activation.{kind.__name__}'>": name for name, kind in ACTIVATIONS.items()}
 
 
 def load_sb3_prior(
@@ -27,26 +32,32 @@ def load_sb3_prior(
     *,
     vecnormalize: str | os.PathLike[str] | None = None,
     std: float | Tensor | None = None,
+    temperature: float | None = None,
+    clip_mean: bool = True,
     activation: str | None = None,
     one_hot: bool = False,
     in_key: NestedKey = "observation",
     namespace: NestedKey = "prior",
     device: torch.device | str | None = None,
-) -> ModulePrior:
-    r"""A policy of Stable-Baselines3 as a teacher: PPO, A2C, SAC or TD3, from the file that ``model.save`` wrote.
+) -> ModulePrior | BoltzmannPrior:
+    r"""A policy of Stable-Baselines3 as a teacher, from the file that ``model.save`` wrote.
 
-    Stable-Baselines3 need not be installed, and no code of the files runs: weights are loaded by
+    It reads PPO, A2C, SAC, TD3, DDPG and DQN of ``stable_baselines3``, and TQC, TRPO and QR-DQN of ``sb3_contrib``.
+    Neither need be installed, and no code of the files runs: weights are loaded by
     ``torch.load(weights_only=True)``, and of what is pickled only numbers, arrays and names are read.
 
     What the teacher's distribution is, in the unit of the environment's actions:
 
-    * PPO, A2C, discrete actions: a :class:`~torch.distributions.Categorical` over indices, or, with ``one_hot``, a
-      :class:`~torchrl.modules.OneHotCategorical`, as the students of a :func:`~torchrl.envs.GymEnv` are by default;
-    * PPO, A2C, continuous: a Gaussian, before the clipping to the bounds that Stable-Baselines3 does when it acts;
-    * SAC: a :class:`~torchrl.modules.TanhNormal` within the bounds. Stable-Baselines3's own ``log_prob`` is that of
-      actions scaled to [-1, 1], and adds 1e-6 to :math:`1-\tanh^2`; this one is exact;
-    * TD3, and any other continuous one with ``std``: a Gaussian around the deterministic action. A Gaussian student of
-      a SAC teacher needs it: its actions can leave the bounds, where a squashed teacher has no finite opinion.
+    * PPO, A2C, TRPO, discrete actions: a :class:`~torch.distributions.Categorical` over indices, or, with ``one_hot``,
+      a :class:`~torchrl.modules.OneHotCategorical`, as the students of a :func:`~torchrl.envs.GymEnv` are by default;
+    * PPO, A2C, TRPO, continuous: a Gaussian whose mean is clipped to the bounds of the actions, as Stable-Baselines3
+      clips what it sends. With ``clip_mean=False`` it is the policy's own, and so are its log-probabilities;
+    * SAC, TQC: a :class:`~torchrl.modules.TanhNormal` within the bounds. Stable-Baselines3's own ``log_prob`` is that
+      of actions scaled to [-1, 1], and adds 1e-6 to :math:`1-\tanh^2`; this one is exact;
+    * TD3, DDPG, and any other continuous one with ``std``: a Gaussian around the deterministic action. A Gaussian
+      student of a SAC teacher needs it: its actions can leave the bounds, where a squashed teacher has no finite
+      opinion. So does a policy with state-dependent noise (``use_sde=True``);
+    * DQN, QR-DQN: a :class:`~torchrl_priors.BoltzmannPrior` of the action values, which are the means of the quantiles.
 
     It can be written to a file of this library by :func:`save_prior`. ``python -m recipes.export_sb3`` does both.
 
@@ -57,11 +68,15 @@ def load_sb3_prior(
         vecnormalize (str or path, optional): the file of ``VecNormalize.save``, whose statistics the policy was trained
             with. Defaults to ``None``: it reads raw observations.
         std (float or Tensor, optional): standard deviation of a Gaussian around the deterministic action, in the unit
-            of the action, a number or one per dimension; required for TD3. Defaults to ``None``: the policy's own
-            distribution.
+            of the action, a number or one per dimension; required for TD3, DDPG and ``use_sde=True``. Defaults to
+            ``None``: the policy's own distribution.
+        temperature (float, optional): of the softmax over action values, in the unit of the returns; required for DQN
+            and QR-DQN, of no use for others.
+        clip_mean (bool): whether the mean of PPO, A2C or TRPO is clipped to the bounds of the actions, where they are
+            finite. Defaults to ``True``: a mean far beyond would draw a student there, where nothing changes.
         activation (str, optional): what the policy must have, one of :data:`~torchrl_priors.networks.ACTIVATIONS`: only
-            a check, for what the file says counts, and if it says nothing Stable-Baselines3's default (tanh for PPO and
-            A2C, ReLU for SAC and TD3). Defaults to ``None``: not checked.
+            a check, for what the file says counts, and if it says nothing Stable-Baselines3's default (tanh for PPO,
+            A2C and TRPO, ReLU for the others). Defaults to ``None``: not checked.
         one_hot (bool): whether discrete actions are one-hot ``[*B, A]``, not indices ``[*B]``. Defaults to ``False``.
         in_key (NestedKey): raw observations ``[*B, *obs]``, images with channels first. Defaults to ``"observation"``.
         namespace (NestedKey): as in :class:`~torchrl_priors.ActionPrior`.
@@ -71,27 +86,113 @@ def load_sb3_prior(
         FileNotFoundError: there is no such file.
         ArtifactError: a file is damaged or none of Stable-Baselines3; or the policy is of a kind that can't be read:
             observations of several entries or discrete ones, actions that are neither ``Discrete`` nor a ``Box`` of one
-            dimension, state-dependent exploration, recurrent or custom networks.
-        ValueError: TD3 without ``std``, ``std`` with discrete actions or of another size than the actions, ``one_hot``
-            with continuous ones, or an activation that the policy does not have.
+            dimension, recurrent or custom networks, statistics of single frames. The message says how
+            :class:`~torchrl_priors.CallablePrior` takes it.
+        ValueError: TD3 without ``std``, DQN without ``temperature``; ``std`` with discrete actions or of another size
+            than the actions, ``one_hot`` with continuous ones, ``temperature`` without action values, or an activation
+            that the policy does not have.
     """
     try:
         checkpoint = read_checkpoint(Path(path))
         _check(checkpoint)
+        if checkpoint.use_sde and std is None:
+            raise ArtifactError(
+                "it explores by state-dependent noise (use_sde=True): pass std, the spread around its deterministic"
+                " action in the unit of the action"
+            )
     except ArtifactError as error:
-        raise ArtifactError(f"{path} can't be used as a Stable-Baselines3 policy: {error}.") from error
+        raise _refused(path, error) from error
+    family = find_family(checkpoint)
+    discrete = checkpoint.action_space.kind == "Discrete"
+    _check_arguments(path, checkpoint, family, std=std, temperature=temperature, one_hot=one_hot)
     statistics = None if vecnormalize is None else read_vecnormalize(Path(vecnormalize))
-    space = checkpoint.observation_space
-    if statistics is not None and tuple(statistics.mean.shape) != space.shape:
+    if statistics is not None and tuple(statistics.mean.shape) != checkpoint.observation_space.shape:
         raise ArtifactError(
             f"{vecnormalize} has statistics of observations {tuple(statistics.mean.shape)}, and the policy of {path}"
-            f" reads {space.shape}."
+            f" reads {checkpoint.observation_space.shape}.{_frames(statistics, checkpoint)}"
         )
+    kwargs: dict[str, Any] = {"in_keys": [in_key], "namespace": namespace}
+    if one_hot:
+        kwargs["distribution_class"] = OneHotCategorical
+    try:
+        kind = _activation(checkpoint, "tanh" if family == "on_policy" else "relu", activation)
+        network = build_layers(checkpoint, statistics, kind, deterministic=std is not None, clip_mean=clip_mean)
+        if family == "squashed" and std is None:
+            low, high = action_bounds(checkpoint)
+            kwargs |= {"distribution_class": TanhNormal, "distribution_kwargs": {"low": low, "high": high}}
+    except ArtifactError as error:
+        raise _refused(path, error) from error
+    if temperature is not None:
+        return BoltzmannPrior(network, temperature, **kwargs).to(device)
+    output: Literal["logits", "mean", "mean_std"] = "logits" if discrete else "mean_std" if std is None else "mean"
+    return ModulePrior(network, output, std=std, **kwargs).to(device)
+
+
+def _refused(path: str | os.PathLike[str], error: ArtifactError) -> ArtifactError:
+    return ArtifactError(f"{path} can't be used as a Stable-Baselines3 policy: {error}.")
+
+
+def _check(checkpoint: Checkpoint) -> None:
+    """Refuses what can't be converted, and says what can be done."""
+    unsupported = _unsupported(checkpoint)
+    if unsupported is not None:
+        raise ArtifactError(f"{unsupported}. Stable-Baselines3 can play it: {_instead(checkpoint)}")
+    discrete, family = checkpoint.action_space.kind == "Discrete", find_family(checkpoint)
+    if checkpoint.use_sde and discrete:
+        raise ArtifactError("it is damaged: it has discrete actions and state-dependent noise (use_sde=True)")
+    if family != "on_policy" and discrete != (family == "values"):
+        raise ArtifactError(f"it is damaged: its weights are not of actions of a {checkpoint.action_space.kind} space")
+
+
+def _unsupported(checkpoint: Checkpoint) -> str | None:
+    observations, actions = checkpoint.observation_space, checkpoint.action_space
+    if not _POLICIES.fullmatch(checkpoint.policy_module):
+        return (
+            f"its policy class is one of {checkpoint.policy_module or 'an unknown module'}, and only those of PPO, A2C,"
+            " SAC, TD3, DDPG and DQN in stable_baselines3 and of TQC, TRPO and QR-DQN in sb3_contrib are known"
+        )
+    if observations.kind != "Box":
+        return f"its observations are a {observations.kind} space, a Box is supported"
+    if actions.kind not in ("Box", "Discrete") or (actions.kind == "Box" and len(actions.shape) != 1):
+        shape = f" {actions.shape}" if actions.shape else ""
+        return f"its actions are a {actions.kind} space{shape}, Discrete and Box of one dimension are supported"
+    if actions.start:
+        return f"its discrete actions start at {actions.start}, 0 is supported"
+    extractor = checkpoint.options.get("features_extractor_class")
+    if extractor is not None and not _EXTRACTORS.search(str(extractor)):
+        return f"its features extractor is {short(extractor)}, only FlattenExtractor and NatureCNN are known"
+    activation = checkpoint.options.get("activation_fn")
+    if activation is not None and str(activation) not in _ACTIVATIONS:
+        return f"its activation is {short(activation)}, known are {', '.join(sorted(ACTIVATIONS))}"
+    return None
+
+
+def _instead(checkpoint: Checkpoint) -> str:
+    """How a prior of another kind has the policy."""
+    spread = "num_actions=..." if checkpoint.action_space.kind == "Discrete" else "std=..."
+    if checkpoint.observation_space.kind == "Dict":
+        call = 'lambda a, b: model.predict({"a": a, "b": b}, deterministic=True)[0]'
+        return f'CallablePrior({call}, in_keys=["a", "b"], {spread})'
+    return f"CallablePrior(lambda o: model.predict(o, deterministic=True)[0], {spread})"
+
+
+def _check_arguments(
+    path: str | os.PathLike[str],
+    checkpoint: Checkpoint,
+    family: Family,
+    *,
+    std: float | Tensor | None,
+    temperature: float | None,
+    one_hot: bool,
+) -> None:
+    """Refuses what is missing or of no use for this policy."""
     discrete = checkpoint.action_space.kind == "Discrete"
-    off_policy = any(name.startswith("actor.") for name in checkpoint.weights)
-    squashed = "actor.log_std.weight" in checkpoint.weights
-    if off_policy and not squashed and std is None:
+    if family == "deterministic" and std is None:
         raise ValueError(f"{path} is a deterministic policy (TD3): pass std, its spread in the unit of the action.")
+    if family == "values" and temperature is None:
+        raise ValueError(f"{path} has action values (DQN): pass temperature, of their softmax, in their unit.")
+    if family != "values" and temperature is not None:
+        raise ValueError(f"{path} is a policy without action values: temperature={temperature} is of no use.")
     if discrete and std is not None:
         raise ValueError(f"{path} is a policy over discrete actions: std={std} is of no use.")
     if one_hot and not discrete:
@@ -101,187 +202,29 @@ def load_sb3_prior(
             f"std must be a number or have one for each of {checkpoint.action_space.shape[0]} dimensions of the actions"
             f" of {path}, got shape {tuple(torch.as_tensor(std).shape)}."
         )
-    try:
-        kind = _activation(checkpoint, "relu" if off_policy else "tanh", activation)
-        parts = _Parts(checkpoint.weights)
-        layers = [*_first_layers(parts, checkpoint, statistics, "actor." if off_policy else "")]
-        kwargs: dict[str, Any] = {"in_keys": [in_key], "namespace": namespace}
-        if off_policy:
-            layers += _off_policy_layers(parts, checkpoint, kind, squashed, deterministic=std is not None)
-        else:
-            layers += parts.mlp("mlp_extractor.shared_net.", kind) + parts.mlp("mlp_extractor.policy_net.", kind)
-            layers.append(parts.linear("action_net."))
-            if not discrete:
-                log_std = parts.take("log_std")
-                layers += [StateIndependentStd(log_std)] if std is None else []
-        parts.check_all_taken()
-        _check_sizes(layers, checkpoint)
-        check_values(nn.Sequential(*layers))
-        if squashed and std is None:
-            low, high = _bounds(checkpoint)
-            kwargs |= {"distribution_class": TanhNormal, "distribution_kwargs": {"low": low, "high": high}}
-    except ArtifactError as error:
-        raise ArtifactError(f"{path} can't be used as a Stable-Baselines3 policy: {error}.") from error
-    if one_hot:
-        kwargs["distribution_class"] = OneHotCategorical
-    output = "logits" if discrete else "mean_std" if std is None else "mean"
-    return ModulePrior(nn.Sequential(*layers), output, std=std, **kwargs).to(device)  # type: ignore[arg-type]
 
 
-def _check(checkpoint: Checkpoint) -> None:
-    """Refuses what can't be converted."""
-    if checkpoint.use_sde or checkpoint.options.get("use_sde"):
-        raise ArtifactError("it explores by state-dependent noise (use_sde=True), which is not supported")
-    if not re.fullmatch(r"stable_baselines3\.(common|ppo|a2c|sac|td3)\.policies", checkpoint.policy_module):
-        raise ArtifactError(
-            f"its policy class is one of {checkpoint.policy_module or 'an unknown module'}, and only those of PPO, A2C,"
-            " SAC and TD3 in stable_baselines3 are known; ModulePrior takes any network"
-        )
-    if checkpoint.observation_space.kind != "Box":
-        raise ArtifactError(f"its observations are a {checkpoint.observation_space.kind} space, a Box is supported")
-    actions = checkpoint.action_space
-    if actions.kind not in ("Box", "Discrete") or (actions.kind == "Box" and len(actions.shape) != 1):
-        raise ArtifactError(
-            f"its actions are a {actions.kind} space {actions.shape or ''}, Discrete and Box of one dimension are"
-            " supported"
-        )
-    if actions.start:
-        raise ArtifactError(f"its discrete actions start at {actions.start}, 0 is supported")
-    extractor = checkpoint.options.get("features_extractor_class")
-    if extractor is not None and not re.search(
-        r"stable_baselines3\.common\.torch_layers\.(FlattenExtractor|NatureCNN)'", str(extractor)
-    ):
-        raise ArtifactError(f"its features extractor is {extractor}, only FlattenExtractor and NatureCNN are known")
+def _frames(statistics: Statistics, checkpoint: Checkpoint) -> str:
+    """What to do where observations are several of the frames that were normalised."""
+    one, stacked = tuple(statistics.mean.shape), checkpoint.observation_space.shape
+    if len(one) != len(stacked):
+        return ""
+    factors = [whole / size for size, whole in zip(one, stacked, strict=True) if size != whole]
+    if len(factors) != 1 or not factors[0].is_integer():
+        return ""
+    return (
+        " It looks like VecFrameStack over VecNormalize, which is not supported: the frames before the first are zeros"
+        " after normalisation. Normalise frames and stack them in the environment, and pass no vecnormalize; or use"
+        f" {_instead(checkpoint)} there."
+    )
 
 
 def _activation(checkpoint: Checkpoint, default: str, given: str | None) -> type[nn.Module]:
     """The activation that the file names, or the default, which is what Stable-Baselines3 makes of it too."""
-    known = {f"<class 'torch.nn.modules.activation.{kind.__name__}'>": name for name, kind in ACTIVATIONS.items()}
-    written = checkpoint.options.get("activation_fn")
-    if written is not None and str(written) not in known:
-        raise ArtifactError(f"its activation is {written}, known are {', '.join(sorted(ACTIVATIONS))}")
     if given is not None and given not in ACTIVATIONS:
         raise ValueError(f"Unknown activation {given!r}: choose one of {', '.join(sorted(ACTIVATIONS))}.")
-    found = default if written is None else known[str(written)]
+    written = checkpoint.options.get("activation_fn")
+    found = default if written is None else _ACTIVATIONS[str(written)]
     if given is not None and given != found:
         raise ValueError(f"activation={given!r} contradicts the file, whose policy has {found!r}.")
     return ACTIVATIONS[found]
-
-
-def _bounds(checkpoint: Checkpoint) -> tuple[Tensor, Tensor]:
-    space = checkpoint.action_space
-    low, high = (torch.as_tensor(bound).float() for bound in (space.low, space.high))
-    if not (low.isfinite().all() and high.isfinite().all() and (low < high).all()):
-        raise ArtifactError(f"its actions must have finite bounds, got {low.tolist()} and {high.tolist()}")
-    return low, high
-
-
-def _first_layers(
-    parts: _Parts, checkpoint: Checkpoint, statistics: Statistics | None, prefix: str
-) -> tuple[nn.Module, ...]:
-    """From raw observations to features."""
-    space = checkpoint.observation_space
-    own = f"{prefix}pi_features_extractor."  # of a policy that does not share it with the critic
-    if any(name.startswith(own) for name in parts.left):
-        parts.drop("features_extractor.")
-    else:
-        own = f"{prefix}features_extractor."
-    cnn = any(name.startswith(own) for name in parts.left)
-    first = TeacherInput(
-        space.shape,
-        statistics=None if statistics is None else (statistics.mean, statistics.var),
-        pixels=space.is_image and checkpoint.options.get("normalize_images", True) is not False,
-        flatten=not cnn,
-        **({} if statistics is None else {"eps": statistics.epsilon, "clip": statistics.clip}),
-    )
-    return (first, parts.nature_cnn(own, space.shape)) if cnn else (first,)
-
-
-def _off_policy_layers(
-    parts: _Parts, checkpoint: Checkpoint, kind: type[nn.Module], squashed: bool, *, deterministic: bool
-) -> list[nn.Module]:
-    """From features to a mean and a standard deviation before squashing, or to an action in the environment's unit."""
-    if squashed:
-        layers = parts.mlp("actor.latent_pi.", kind)
-        mean, log_std = parts.linear("actor.mu."), parts.linear("actor.log_std.")
-        if not deterministic:
-            with torch.device("meta"):
-                head = GaussianHead(mean.in_features, mean.out_features)
-            head.mean, head.log_std = mean, log_std
-            if mean.weight.shape != log_std.weight.shape:
-                raise ArtifactError("its mean and its standard deviation are of different sizes")
-            return [*layers, head]
-        layers.append(mean)
-    else:
-        layers = parts.mlp("actor.mu.", kind)[:-1]
-    low, high = _bounds(checkpoint)
-    return [*layers, nn.Tanh(), ScaleToBox(low, high)]
-
-
-def _check_sizes(layers: list[nn.Module], checkpoint: Checkpoint) -> None:
-    """Runs the network once, so that layers that do not fit are found here."""
-    actions = checkpoint.action_space
-    size = actions.n if actions.kind == "Discrete" else actions.shape[0]
-    try:
-        with torch.no_grad():
-            out = nn.Sequential(*layers)(torch.zeros(1, *checkpoint.observation_space.shape))
-    except (RuntimeError, ValueError) as error:
-        raise ArtifactError(f"its layers do not fit its observations and each other: {error}") from None
-    for value in out if isinstance(out, tuple) else (out,):
-        if value.shape != (1, size):
-            raise ArtifactError(f"its policy is over {tuple(value.shape[1:])} actions, and its action space has {size}")
-
-
-class _Parts:
-    """The tensors of a policy, taken one layer after the other."""
-
-    ignored = ("value_net.", "mlp_extractor.value_net.", "vf_features_extractor.", "critic.", "critic_target.")
-
-    def __init__(self, weights: dict[str, Tensor]) -> None:
-        self.left = dict(weights)
-        for prefix in (*self.ignored, "actor_target."):
-            self.drop(prefix)
-
-    def drop(self, prefix: str) -> None:
-        self.left = {name: value for name, value in self.left.items() if not name.startswith(prefix)}
-
-    def take(self, name: str) -> Tensor:
-        if name not in self.left:
-            raise ArtifactError(f"its policy lacks {name}")
-        value = self.left.pop(name)
-        if value.dtype is not torch.float32 or not value.isfinite().all():
-            raise ArtifactError(f"{name} must be finite and float32")
-        return value
-
-    def linear(self, prefix: str) -> nn.Linear:
-        weight, bias = self.take(f"{prefix}weight"), self.take(f"{prefix}bias")
-        if weight.ndim != 2 or bias.shape != weight.shape[:1]:
-            raise ArtifactError(f"{prefix}weight and bias are no linear layer: {weight.shape}, {bias.shape}")
-        layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
-        layer.load_state_dict({"weight": weight, "bias": bias}, assign=True)
-        return layer
-
-    def mlp(self, prefix: str, activation: type[nn.Module]) -> list[nn.Module]:
-        """Linear layers under even numbers, an activation after each."""
-        found = {name.removeprefix(prefix).partition(".")[0] for name in self.left if name.startswith(prefix)}
-        if found != {str(2 * number) for number in range(len(found))}:
-            raise ArtifactError(f"{prefix}* are layers {', '.join(sorted(found))}: not a plain stack of linear ones")
-        return [
-            layer for number in range(len(found)) for layer in (self.linear(f"{prefix}{2 * number}."), activation())
-        ]
-
-    def nature_cnn(self, prefix: str, shape: tuple[int, ...]) -> NatureCNN:
-        mine = {name: self.take(name) for name in list(self.left) if name.startswith(prefix)}
-        tensors = {name.removeprefix(prefix): value for name, value in mine.items()}
-        bias = tensors.get("linear.0.bias")
-        try:
-            with torch.device("meta"):
-                net = NatureCNN(shape, 512 if bias is None else len(bias))
-            net.load_state_dict(tensors, assign=True)
-        except (RuntimeError, TypeError, ValueError) as error:
-            raise ArtifactError(f"its features extractor is no NatureCNN: {error}") from None
-        return net
-
-    def check_all_taken(self) -> None:
-        if self.left:
-            raise ArtifactError(f"its policy has parts that are not known: {differing(self.left)}")

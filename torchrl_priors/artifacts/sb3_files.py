@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 import sys
 import zipfile
 from dataclasses import dataclass
@@ -17,11 +18,17 @@ from torch import Tensor
 
 from torchrl_priors.artifacts.errors import ArtifactError, InertPickleError, short
 from torchrl_priors.artifacts.inert_pickle import MAX_BYTES, StandIn, read_pickle
+from torchrl_priors.artifacts.legacy_torch import LEGACY_START, read_legacy
 from torchrl_priors.artifacts.pickle_program import check_program
 
 __all__ = ["Checkpoint", "Space", "Statistics", "read_checkpoint", "read_vecnormalize"]
 
 _MAX_WEIGHTS = 1 << 30  # bytes, unpacked; of all else, MAX_BYTES
+_OLDER = re.compile(rb"stable_baselines\.\w")
+_OLDER_MESSAGE = (
+    "it is of Stable-Baselines 2, which runs on TensorFlow and is not supported. It can play its policy:"
+    " CallablePrior(lambda o: model.predict(o, deterministic=True)[0], std=...)"
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,12 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if not path.is_file():
         raise FileNotFoundError(f"No Stable-Baselines3 model at {path}.")
     try:
+        if not zipfile.is_zipfile(path):
+            with path.open("rb") as file:
+                _refuse_older(file.read(MAX_BYTES))
         with zipfile.ZipFile(path) as archive:
+            if "parameter_list" in archive.namelist():
+                raise ArtifactError(_OLDER_MESSAGE)
             data, weights = _member(archive, "data"), _member(archive, "policy.pth")
             names = archive.namelist()
             version = _member(archive, "_stable_baselines3_version") if "_stable_baselines3_version" in names else b""
@@ -89,15 +101,22 @@ def read_checkpoint(path: Path) -> Checkpoint:
     if not isinstance(values, dict):
         raise ArtifactError("its data are no object of JSON")
     options, policy = values.get("policy_kwargs"), values.get("policy_class")
+    options = options if isinstance(options, dict) else {}
     return Checkpoint(
         observation_space=_space(values, "observation_space"),
         action_space=_space(values, "action_space"),
         policy_module=str(policy.get("__module__")) if isinstance(policy, dict) else "",
-        options=options if isinstance(options, dict) else {},
-        use_sde=values.get("use_sde") not in (None, False),
+        options=options,
+        use_sde=any(part.get("use_sde") not in (None, False) for part in (values, options)),
         version=version.decode("utf-8", "replace").strip()[:100],
         weights=_weights(weights),
     )
+
+
+def _refuse_older(data: bytes) -> None:
+    """Recognises a pickle by the names in it."""
+    if _OLDER.search(data):
+        raise ArtifactError(_OLDER_MESSAGE)
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> bytes:
@@ -111,14 +130,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
 
 def _weights(data: bytes) -> dict[str, Tensor]:
     try:
-        # torch.load(weights_only=True) runs no code, but hashes what the pickle says, and unpacks what it claims
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > 2 * len(data):  # torch.save does not compress
-                raise ValueError("its entries are larger than it is")
-            for entry in archive.infolist():
-                if entry.filename.endswith(".pkl"):
-                    check_program(archive.read(entry))
-        weights = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+        weights = read_legacy(data) if data.startswith(LEGACY_START) else _read_zipped(data)
     except Exception as error:  # a damaged file fails in any way
         reason = (str(error).splitlines() or [""])[0]
         raise ArtifactError(f"its policy.pth can't be read as tensors: {type(error).__name__}: {reason}") from None
@@ -132,6 +144,19 @@ def _weights(data: bytes) -> dict[str, Tensor]:
         if value.numel() * value.element_size() > len(data):  # a view of one number as many
             raise ArtifactError(f"{short(name)} of shape {tuple(value.shape)} is larger than the file")
     return dict(weights)
+
+
+def _read_zipped(data: bytes) -> Any:
+    """Runs no code; but PyTorch hashes what the pickle says, and unpacks what it claims, which is checked before."""
+    if not data.startswith(b"PK\x03\x04"):  # by which PyTorch knows it
+        raise ValueError("it is no zip of torch.save")
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > 2 * len(data):  # torch.save does not compress
+            raise ValueError("its entries are larger than it is")
+        for entry in archive.infolist():
+            if entry.filename.endswith(".pkl"):
+                check_program(archive.read(entry))
+    return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
 
 
 def _space(values: dict[str, Any], name: str) -> Space:
@@ -175,7 +200,9 @@ def read_vecnormalize(path: Path) -> Statistics | None:
     try:
         if (size := path.stat().st_size) > MAX_BYTES:
             raise ArtifactError(f"it has {size} bytes, expected at most {MAX_BYTES}")
-        found = read_pickle(path.read_bytes())
+        data = path.read_bytes()
+        _refuse_older(data)
+        found = read_pickle(data)
         if not isinstance(found, StandIn) or not found.pickled_name.endswith(".VecNormalize"):
             raise ArtifactError(f"it holds {type(found).__name__}, expected VecNormalize")
         state = found.state

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_priors.collectors.env_state import env_state_dict, load_env_state_dict
+from torchrl_priors.collectors.interface import CollectorInterface
 from torchrl_priors.collectors.policy_step import policy_step
 from torchrl_priors.collectors.running_norm import RunningNorm
 from torchrl_priors.collectors.vector_env import check_vector_env, spread_seed
@@ -22,12 +23,12 @@ if TYPE_CHECKING:
 __all__ = ["VectorCollector"]
 
 
-class VectorCollector:
+class VectorCollector(CollectorInterface):
     """Iterates over rollouts ``[num_envs, T]`` of a policy in a vector of Gymnasium environments.
 
     A stand-in for :class:`torchrl.collectors.Collector` where its cost per step outweighs the simulator's: observations
     stay in arrays, the policy is called once a step for all environments (a Gaussian policy without any tensordict),
-    and one tensordict is made per rollout.
+    and one tensordict is made per rollout. It has what TorchRL's trainers and loops call on a collector.
 
     1. The policy explores (it is sampled), without gradient, with random numbers of the collector's own. Its parameters
        are used where they are: there are no weights to send. Its training mode is left alone.
@@ -104,52 +105,52 @@ class VectorCollector:
         seed: int | None = None,
     ) -> None:
         check_vector_env(env)
-        if frames_per_batch < 1 or frames_per_batch % env.num_envs:
-            raise ValueError(
-                f"frames_per_batch ({frames_per_batch}) must be a multiple of {env.num_envs} environments."
-            )
-        if total_frames != -1 and (total_frames < 1 or total_frames % frames_per_batch):
-            raise ValueError(
-                f"total_frames ({total_frames}) must be a multiple of frames_per_batch ({frames_per_batch}), or -1."
-            )
-        self.env = env
-        self.policy = policy
-        self.frames_per_batch = frames_per_batch
-        self.total_frames = total_frames
+        super().__init__(env, policy, frames_per_batch=frames_per_batch, total_frames=total_frames)
         self.normalizer = normalizer
         self.postproc = postproc
         self.device = torch.device(device)
         self.observation_key = observation_key
         self.action_key = action_key
         self.normalized_key = normalized_key
-        self.frames = 0
-        """Steps of all environments together since the beginning."""
 
         inputs = [observation_key] if normalizer is None else [observation_key, normalized_key]
         self._step = policy_step(policy, action_key, inputs)
         self._generator = torch.Generator(self.device)
         self._low, self._high = env.single_action_space.low, env.single_action_space.high
         self._obs = np.empty((env.num_envs, *env.single_observation_space.shape), np.float32)
-        self._traj_ids = np.arange(env.num_envs)
-        self._next_traj_id = env.num_envs
-        self._episode_reward = np.zeros(env.num_envs)
-        self._step_count = np.zeros(env.num_envs, np.int64)
         self.set_seed(seed)
 
-    def set_seed(self, seed: int | None) -> None:
-        """Seeds environments and actions, and begins new episodes."""
+    def set_seed(self, seed: int | None, static_seed: bool = False) -> int:
+        """Seeds environments and actions, and begins new episodes.
+
+        Args:
+            seed (int, optional): ``None`` for one of the operating system's.
+            static_seed (bool): whether the same seed is returned, not the next one. Defaults to ``False``.
+
+        Returns:
+            int: a seed for whatever is seeded next.
+        """
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
         env_seeds, action_seed = spread_seed(seed, self.env.num_envs, stream=0)
         self._generator.manual_seed(action_seed)
         self._obs[...], _ = self.env.reset(seed=env_seeds)
         self._traj_ids = np.arange(self.env.num_envs)
         self._next_traj_id = self.env.num_envs
-        self._episode_reward[...] = 0
-        self._step_count[...] = 0
+        self._episode_reward = np.zeros(self.env.num_envs)
+        self._step_count = np.zeros(self.env.num_envs, np.int64)
+        return seed if static_seed else seed + 1
 
-    def __iter__(self) -> Iterator[TensorDictBase]:
-        """Rollouts until ``total_frames``; continues where it was left, also after :meth:`load_state_dict`."""
-        while self.total_frames == -1 or self.frames < self.total_frames:
-            yield self.rollout()
+    def reset(self, index: int | Sequence[int] | Tensor | None = None) -> None:
+        """Begins new episodes, of new ``("collector", "traj_ids")``.
+
+        Args:
+            index (int, sequence of int or Tensor, optional): of which environments. Defaults to ``None``: of all.
+        """
+        where = np.full(self.env.num_envs, index is None)
+        if index is not None:
+            where[np.asarray(index)] = True
+        self._begin_episodes(where, self._step_count[:, None], self._traj_ids[:, None])
 
     def rollout(self) -> TensorDictBase:
         """The next rollout, whatever ``total_frames`` is."""
@@ -322,10 +323,6 @@ class VectorCollector:
         if self.normalizer is not None:
             self.normalizer.load_state_dict(state_dict["normalizer"])
             self.normalizer.freeze(bool(state_dict["normalizer_frozen"]))
-
-    def shutdown(self) -> None:
-        """Closes the environments."""
-        self.env.close()
 
 
 def _arrays(tensors: Mapping[NestedKey, Tensor]) -> dict[NestedKey, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,12 +21,17 @@ __all__ = ["CallablePrior"]
 class CallablePrior(ModulePrior):
     r"""A Gymnasium-style controller, ``action = policy(observation)`` on NumPy arrays, with a spread around its action.
 
-    For scripted controllers and hard-coded bots. It must be a function of the observation alone: rollouts are scored in
-    any order. Continuous actions get a Gaussian, :math:`\pi_0(\cdot|s)=\mathcal N(\text{policy}(s), \sigma^2)`,
-    discrete ones :math:`\pi_0(a|s) = (1-\epsilon)\,[a=\text{policy}(s)] + \epsilon/A`: log-probabilities are finite.
+    For scripted controllers, hard-coded bots, and models of other libraries. It must be a function of the observation
+    alone: rollouts are scored in any order. It is called where it is, and not copied: an object whose method it is may
+    have files or a simulator open, and must not change. ``model.predict`` of Stable-Baselines3 is taken as it is: it is
+    asked for the deterministic action, and the action is taken from the pair that it returns.
+
+    Continuous actions get a Gaussian, :math:`\pi_0(\cdot|s)=\mathcal N(\text{policy}(s), \sigma^2)`, discrete ones
+    :math:`\pi_0(a|s) = (1-\epsilon)\,[a=\text{policy}(s)] + \epsilon/A`: log-probabilities are finite.
 
     Args:
-        policy (Callable): from the arrays under ``in_keys`` to an action, an array ``[act_dim]`` or an integer.
+        policy (Callable): from the arrays under ``in_keys`` to an action, an array ``[act_dim]`` or an integer; or to
+            a pair of it and ``None``. If it has an argument ``deterministic``, it is called with ``True``.
 
     Keyword Args:
         std (float or sequence of float, optional): of a continuous action, in its unit, a number or one per dimension.
@@ -39,6 +45,7 @@ class CallablePrior(ModulePrior):
         namespace (str or tuple of str): as in :class:`Prior`.
 
     Raises:
+        TypeError: ``policy`` can't be called; at call, it returns a state beside its action: it has a memory.
         ValueError: neither ``std`` nor ``num_actions``, or both, or out of range; at call, the policy's action has
             another shape, is not finite, or is no action index.
 
@@ -81,6 +88,36 @@ class CallablePrior(ModulePrior):
         )
 
 
+class _Shared:
+    """A controller that copies of a prior have in common; it gives an action, alone or in a pair with ``None``."""
+
+    def __init__(self, policy: Callable[..., Any]) -> None:
+        self.policy = policy
+        self.options = {"deterministic": True} if _has_argument(policy, "deterministic") else {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _Shared:
+        return self
+
+    def __call__(self, *arrays: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        found = self.policy(*arrays, **self.options)
+        if isinstance(found, tuple) and len(found) == 2:
+            action, state = found
+            if isinstance(action, np.ndarray) and isinstance(state, tuple):
+                raise TypeError(
+                    "The controller returned a state beside its action: it has a memory, and a prior's advice is a"
+                    " function of the observation alone."
+                )
+            found = action if state is None else found
+        return np.asarray(found)
+
+
+def _has_argument(function: Callable[..., Any], name: str) -> bool:
+    try:
+        return name in inspect.signature(function).parameters
+    except (TypeError, ValueError):  # it is not written in Python
+        return False
+
+
 class _Controller(nn.Module):
     """A policy of arrays as a network of tensors, ``[N, ...]``: its actions, or the logits of discrete ones."""
 
@@ -90,14 +127,16 @@ class _Controller(nn.Module):
             raise TypeError(f"A CallablePrior needs a function of an observation, got {type(policy).__name__}.")
         if num_actions is not None and num_actions < 1:
             raise ValueError(f"num_actions must be at least 1, got {num_actions}.")
-        self.policy, self.batched, self.num_actions, self.epsilon = policy, batched, num_actions, epsilon
+        self.policy, self.batched, self.num_actions, self.epsilon = _Shared(policy), batched, num_actions, epsilon
 
     def forward(self, *observations: Tensor) -> Tensor:
+        if len(observations[0]) == 0:  # what has no action has the shape of one still
+            return self.forward(*(value.new_zeros(1, *value.shape[1:]) for value in observations))[:0]
         arrays = [value.detach().cpu().numpy().copy() for value in observations]
         if self.batched:
-            found = np.asarray(self.policy(*arrays))
+            found = self.policy(*arrays)
         else:
-            found = np.stack([np.asarray(self.policy(*single)) for single in zip(*arrays, strict=True)])
+            found = np.stack([self.policy(*single) for single in zip(*arrays, strict=True)])
         number = len(arrays[0])
         if found.shape[:1] != (number,):
             raise ValueError(f"A batched controller gave actions of shape {found.shape} for {number} observations.")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 from torch.compiler import is_compiling
 
-__all__ = ["GaussianHead", "NatureCNN", "ScaleToBox", "StateIndependentStd", "TeacherInput"]
+__all__ = ["ClipToBox", "GaussianHead", "NatureCNN", "ScaleToBox", "StateIndependentStd", "TeacherInput"]
 
 
 class TeacherInput(nn.Module):
@@ -82,7 +82,9 @@ class TeacherInput(nn.Module):
         observation = observation.float()
         if self.pixels:
             observation = observation / 255.0
-        return observation.reshape(*observation.shape[:batch_ndim], -1) if self.flatten else observation
+        if not self.flatten:
+            return observation
+        return observation.reshape(*observation.shape[:batch_ndim], math.prod(self.shape))
 
 
 class StateIndependentStd(nn.Module):
@@ -141,6 +143,31 @@ class ScaleToBox(nn.Module):
     def forward(self, action: Tensor) -> Tensor:
         """From ``[*B, A]`` in [-1, 1] to ``[*B, A]`` in the box."""
         return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+
+
+class ClipToBox(nn.Module):
+    """Clips actions to the bounds of a box.
+
+    Args:
+        low, high (Tensor): the bounds, ``[A]``; infinite where there is none, which is kept as the largest number.
+
+    Examples:
+        >>> import torch
+        >>> ClipToBox(torch.tensor([-1.0, -torch.inf]), torch.tensor([1.0, 2.0]))(torch.tensor([[-3.0, -3.0]]))
+        tensor([[-1., -3.]])
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("low", low.detach().nan_to_num())
+        self.register_buffer("high", high.detach().nan_to_num())
+
+    def forward(self, action: Tensor) -> Tensor:
+        """From ``[*B, A]`` to ``[*B, A]`` in the box."""
+        return action.clamp(self.low, self.high)
 
 
 class NatureCNN(nn.Module):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any, Literal, get_args
 
 import torch
@@ -25,7 +26,8 @@ _Output = Literal["logits", "probs", "mean", "mean_std", "distribution"]
 class ModulePrior(ActionPrior):
     r"""Any :class:`torch.nn.Module` as a teacher. What it returns is said, not guessed.
 
-    Like any :class:`ActionPrior` it copies the network and freezes it.
+    Like any :class:`ActionPrior` it copies the network and freezes it. A TorchScript policy (:func:`torch.jit.load`) is
+    such a network too, also after :func:`torch.jit.freeze`.
 
     Args:
         module (nn.Module): from the entries ``in_keys`` to ``output``. It gets and returns ``[N, ...]``: the batch is
@@ -82,6 +84,11 @@ class ModulePrior(ActionPrior):
             )
         if output not in get_args(_Output):
             raise ValueError(f"Unknown output {output!r}: expected one of {', '.join(get_args(_Output))}.")
+        if isinstance(module, torch.jit.ScriptModule):
+            with torch.no_grad():  # TorchScript copies parameters by an operation that has a gradient
+                module = deepcopy(module)
+            for parameter in module.parameters():
+                parameter.requires_grad_(False)
         discrete = output in ("logits", "probs")
         if output == "distribution":
             if distribution_class is None:
