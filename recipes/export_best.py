@@ -18,7 +18,7 @@ from recipes.common.checks import check_keys, require_file_name
 from recipes.common.sweeps import start
 from recipes.report.runs import FinishedRun, find, read
 from torchrl_priors.artifacts import read_manifest
-from torchrl_priors.artifacts.format import write_atomically
+from torchrl_priors.atomic import write_atomically
 
 
 @dataclass

@@ -29,7 +29,7 @@ from omegaconf import MISSING, OmegaConf
 from recipes.common.checks import check_keys, positive
 from recipes.common.sweeps import start
 from torchrl_priors.artifacts import read_manifest
-from torchrl_priors.artifacts.format import write_atomically
+from torchrl_priors.atomic import write_atomically
 
 #: What a run is known by in the tables.
 KEY = ["env", "teacher", "method", "seed"]

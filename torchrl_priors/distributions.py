@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any, TypeGuard
 
 import torch
+from tensordict.nn import CompositeDistribution
 from tensordict.nn.distributions import OneHotCategorical as TensorDictOneHotCategorical
 from torch import Tensor
 from torch import distributions as d
-from torchrl.modules import MaskedOneHotCategorical, OneHotCategorical, OneHotOrdinal, TanhNormal
+from torch.compiler import is_compiling
+from torchrl.modules import MaskedOneHotCategorical, OneHotCategorical, OneHotOrdinal
 from torchrl.modules.distributions.utils import has_analytic_entropy, has_analytic_kl, rsample_and_log_prob
 
 from torchrl_priors.functional import categorical_cross_entropy, gaussian_cross_entropy
@@ -18,10 +20,12 @@ __all__ = [
     "TORCHRL_ONE_HOT",
     "BoxUniform",
     "action_shape",
+    "bounds_of",
     "cross_entropy",
     "cross_entropy_and_kl",
     "cross_entropy_of_advice",
     "kl_divergence",
+    "outside",
     "without_independent",
 ]
 
@@ -91,8 +95,8 @@ def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
         Tensor: nats, ``[*B]``.
 
     Raises:
-        ValueError: the two distributions are over actions of different shapes, the student's are unbounded and the
-            prior's bounded, or ``num_samples`` < 1.
+        ValueError: the two distributions are over actions of different shapes or kinds, the student takes actions
+            outside of the prior's bounds, or ``num_samples`` < 1.
         NotImplementedError: there is no closed form, and the student can't be sampled with a gradient.
 
     Examples:
@@ -103,9 +107,7 @@ def cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, *, num_sampl
         >>> round(cross_entropy(student, teacher).item(), 4)  # -(log 1/4 + log 3/4) / 2
         0.837
     """
-    _check(dist, prior_dist, num_samples)
-    exact = _closed_form(dist, prior_dist)
-    return _estimate(dist, prior_dist, num_samples) if exact is None else exact
+    return _cross_entropy(dist, prior_dist, num_samples)
 
 
 def kl_divergence(dist: d.Distribution, prior_dist: d.Distribution, *, num_samples: int | None = None) -> Tensor:
@@ -132,7 +134,7 @@ def cross_entropy_of_advice(
         _check(dist, prior_dist, num_samples)
         log_probs = dist.logits.masked_fill(dist.logits.isneginf(), 0.0)
         return categorical_cross_entropy(prior_dist.logits, log_probs)
-    return cross_entropy(prior_dist, dist, num_samples=num_samples)
+    return _cross_entropy(prior_dist, dist, num_samples, whose=("prior", "student"))
 
 
 def cross_entropy_and_kl(
@@ -144,6 +146,12 @@ def cross_entropy_and_kl(
     value = _estimate(dist, prior_dist, num_samples) if exact is None else exact
     with torch.no_grad():
         return value, _divergence(dist, prior_dist, exact, num_samples).detach()
+
+
+def _cross_entropy(dist: d.Distribution, prior_dist: d.Distribution, num_samples: int | None, **roles: Any) -> Tensor:
+    _check(dist, prior_dist, num_samples, **roles)
+    exact = _closed_form(dist, prior_dist)
+    return _estimate(dist, prior_dist, num_samples) if exact is None else exact
 
 
 def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | None:
@@ -217,23 +225,65 @@ def _is_mixture(dist: d.Distribution) -> TypeGuard[d.MixtureSameFamily]:
     return isinstance(dist, d.MixtureSameFamily) and _is_gaussian(dist.component_distribution)
 
 
-def _check(dist: d.Distribution, prior_dist: d.Distribution, num_samples: int | None) -> None:
-    """Refuses distributions over different actions, and a teacher without a finite opinion on the student's."""
+def bounds_of(dist: Any) -> tuple[Any, Any] | None:
+    """Where the support of a distribution begins and ends, numbers or tensors; ``None`` for a discrete one."""
+    while not hasattr(dist, "low") and isinstance(dist, (d.Independent, d.MixtureSameFamily)):
+        dist = dist.base_dist if isinstance(dist, d.Independent) else dist.component_distribution
+    if hasattr(dist, "low"):  # what TorchRL's bounded distributions call their support is none
+        return dist.low, dist.high
+    try:
+        support = dist.support
+    except (NotImplementedError, TypeError):  # a distribution that does not say
+        return -torch.inf, torch.inf
+    while hasattr(support, "base_constraint"):
+        support = support.base_constraint
+    return (
+        None
+        if support.is_discrete
+        else (getattr(support, "lower_bound", -torch.inf), getattr(support, "upper_bound", torch.inf))
+    )
+
+
+def _check(
+    dist: d.Distribution,
+    prior_dist: d.Distribution,
+    num_samples: int | None,
+    whose: tuple[str, str] = ("student", "prior"),
+) -> None:
+    """Refuses distributions over different actions, and one without a finite opinion on the other's actions."""
     if num_samples is not None and num_samples < 1:
         raise ValueError(f"num_samples must be at least 1, got {num_samples}.")
-    student, teacher = without_independent(dist), without_independent(prior_dist)
-    if isinstance(student, d.Normal) and isinstance(teacher, TanhNormal):
-        raise ValueError(
-            f"The student's {type(student).__name__} is unbounded, and the prior's {type(teacher).__name__} has no"
-            " finite opinion outside of its bounds: give the student bounded actions (TanhNormal), or make the prior a"
-            " Gaussian, as std=... does in load_sb3_prior."
-        )
+    pair = f"the {whose[0]}'s {type(dist).__name__} and the {whose[1]}'s {type(prior_dist).__name__}"
+    if isinstance(dist, CompositeDistribution) or isinstance(prior_dist, CompositeDistribution):
+        raise NotImplementedError(f"Distributions over several actions at once are not supported, got {pair}.")
     if isinstance(dist, CATEGORICAL) and isinstance(prior_dist, CATEGORICAL):
         shape, prior_shape = dist.logits.shape[-1:], prior_dist.logits.shape[-1:]
     else:
         shape, prior_shape = dist.event_shape, prior_dist.event_shape
     if shape != prior_shape:
         raise ValueError(
-            f"The student and the prior must be distributions over the same actions, got {type(dist).__name__} over"
-            f" {tuple(shape)} and {type(prior_dist).__name__} over {tuple(prior_shape)}."
+            f"Expected distributions over the same actions, got {pair}, over {tuple(shape)} and {tuple(prior_shape)}."
         )
+    if is_compiling():  # bounds are data
+        return
+    bounds, prior_bounds = bounds_of(dist), bounds_of(prior_dist)
+    if (bounds is None) != (prior_bounds is None):
+        raise ValueError(f"Expected distributions over the same actions, got {pair}: only one of them is discrete.")
+    if bounds is None or prior_bounds is None or isinstance(prior_dist, BoxUniform):
+        return
+    if outside(*bounds, prior_bounds):
+        ours, theirs = (
+            f"[{torch.as_tensor(x).min():.4g}, {torch.as_tensor(y).max():.4g}]" for x, y in (bounds, prior_bounds)
+        )
+        raise ValueError(
+            f"Of {pair}, the second has no finite opinion on all actions of the first: they are in {ours}, its own in"
+            f" {theirs}. Give both the same bounds: squash the student (TanhNormal), or make the prior a Gaussian, as"
+            " std=... does in load_sb3_prior."
+        )
+
+
+def outside(low: Any, high: Any, bounds: tuple[Any, Any]) -> bool:
+    """Whether actions, or an interval of them, are not within bounds, up to rounding; numbers or tensors."""
+    lowest, highest = bounds
+    below, above = low < lowest - 1e-5 * (1 + abs(lowest)), high > highest + 1e-5 * (1 + abs(highest))
+    return bool(torch.as_tensor(below | above).any())

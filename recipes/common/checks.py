@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import MISSING, OmegaConf
 
 __all__ = [
+    "at_home",
     "at_least_0",
     "check_keys",
     "finite",
@@ -97,6 +98,18 @@ def _entries(cfg: Any, prefix: str) -> Iterator[tuple[str, Field | None]]:
         yield f"{prefix}{key}", known.get(key)
         if key in known and not OmegaConf.is_missing(cfg, key) and OmegaConf.is_config(cfg[key]):
             yield from _entries(cfg[key], f"{prefix}{key}.")
+
+
+def at_home(key: str, path: str) -> Path:
+    """A path whose ``~`` is one's home directory.
+
+    Raises:
+        ValueError: ``~name`` is nobody's.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"{key}={path}: {error}") from None
 
 
 def require_file_name(out: str) -> None:

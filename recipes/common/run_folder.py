@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from torchrl_priors.artifacts.format import write_atomically
+from recipes.common.checks import at_home
+from torchrl_priors.atomic import write_atomically
 
 __all__ = ["RunFolder", "digest", "flatten", "read_json", "refuse_foreign", "sha256", "write_file"]
 
@@ -96,7 +97,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path, config: dict[str, Any], text: str, may_grow: Sequence[str] = ()) -> None:
-        path = path.expanduser()
+        path = at_home("out", str(path))
         self.path, self.config = path, config
         stamp = path / "config.json"
         try:

@@ -9,7 +9,7 @@ from omegaconf import MISSING
 
 from recipes.common.checks import at_least_0, check_keys, one_of, positive, require, share
 from recipes.common.schedules import ScheduleConfig, check_schedule
-from recipes.gridworld.learners import parse_prior
+from recipes.gridworld.run_parts import parse_prior
 from torchrl_priors.methods import get_method
 
 __all__ = ["GridworldConfig", "check"]

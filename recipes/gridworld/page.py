@@ -14,11 +14,23 @@ from omegaconf import OmegaConf
 from recipes.common.run_folder import write_file
 from recipes.report.markdown import interval, pivot, plus_minus, table
 from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import iqm_bars, learning_curves, method_label, performance_profiles, prior_label, save_figure
+from torchrl_priors.plots import (
+    curve_panels,
+    interval_panels,
+    method_label,
+    prior_label,
+    profile_panels,
+    save_figure,
+)
 
 __all__ = ["summary", "write"]
 
 _TABLES = ("area_ratio", "curves", "comparisons", "prior_weights", "worlds")
+#: Where the paper has its seven priors: quality falls from left to right.
+_PLACES = {
+    **{prior: (0, column) for column, prior in enumerate(("expert", "random_15", "random_30", "random_50"))},
+    **{prior: (1, column) for column, prior in enumerate(("structural_3", "structural_5", "structural_10"), start=1)},
+}
 #: Figures of what is in no table: taken from the folder where they are there.
 _TAKEN = ("performance_profiles", "world", "prior_weights")
 
@@ -70,27 +82,34 @@ def _table(file: Path, *, optional: bool) -> pd.DataFrame:
 
 def _figures(tables: dict[str, pd.DataFrame], profiles: dict[str, np.ndarray] | None) -> dict[str, Figure]:
     ratios, curves = tables["area_ratio"], tables["curves"]
-    bars: dict[str, dict[str, ConfidenceInterval]] = {}
-    paper: dict[str, dict[str, ConfidenceInterval]] = {}
-    for _, row in ratios.iterrows():
-        bars.setdefault(row["prior"], {})[row["method"]] = ConfidenceInterval(*row[["iqm", "ci_low", "ci_high"]])
-        if "paper_iqm" in row and pd.notna(row["paper_iqm"]):
-            values = row[["paper_iqm", "paper_ci_low", "paper_ci_high"]]
-            paper.setdefault(row["prior"], {})[row["method"]] = ConfidenceInterval(*values)
-    lines: dict[str, dict[str, ConfidenceInterval]] = {prior: {} for prior in bars}
-    baseline = None
+    intervals = _by_prior(ratios, ["iqm", "ci_low", "ci_high"])
+    paper = {}
+    if "paper_iqm" in ratios:
+        paper = _by_prior(ratios.dropna(subset=["paper_iqm"]), ["paper_iqm", "paper_ci_low", "paper_ci_high"])
+    lines: dict[str, dict[str, ConfidenceInterval]] = {}
     for (prior, method), rows in curves.groupby(["prior", "method"], sort=False):
         curve = ConfidenceInterval(*rows[["mean", "ci_low", "ci_high"]].to_numpy().T)
-        if method == "none":
-            baseline = curve
-        else:
-            lines[prior][method] = curve
-    steps = curves["transitions"].unique()
+        lines.setdefault(prior_label(prior), {})[method] = curve
+    steps = dict.fromkeys(lines, curves["transitions"].unique())
+    titles = {prior_label(prior): place for prior, place in _PLACES.items()}
+    layout: Any = {"places": titles} if set(titles) == set(lines) else {"columns": 4}
     found = {
-        "learning_curves": learning_curves(lines, baseline=baseline, steps=steps, profiles=profiles),
-        "iqm": iqm_bars(bars, reference=paper or None),
+        "learning_curves": curve_panels(lines, steps, share_y=True, xlabel="Transitions", **layout),
+        "iqm": interval_panels(
+            intervals, scale=1e3, xlabel=r"IQM of $r_{\pi_0}$ ($\times 10^{-3}$)", reference=paper, **layout
+        ),
     }
-    return found if profiles is None else found | {"performance_profiles": performance_profiles(profiles)}
+    if profiles is not None:
+        shown = {"All priors": profiles}
+        found["performance_profiles"] = profile_panels(shown, np.linspace(-1, 1, 201))
+    return found
+
+
+def _by_prior(ratios: pd.DataFrame, columns: list[str]) -> dict[str, dict[str, ConfidenceInterval]]:
+    found: dict[str, dict[str, ConfidenceInterval]] = {}
+    for _, row in ratios.iterrows():
+        found.setdefault(prior_label(row["prior"]), {})[row["method"]] = ConfidenceInterval(*row[columns])
+    return found
 
 
 def _page(folder: Path, out: Path, config: dict[str, Any], tables: dict[str, pd.DataFrame]) -> str:

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from recipes.common.progress import progress_bar
 from recipes.common.run_folder import RunFolder, digest
 from recipes.common.schedules import applies, make_schedule, without_idle
-from recipes.gridworld import learners, page, tabular
+from recipes.gridworld import page, run_parts, tabular
 from recipes.gridworld.config import GridworldConfig
 from recipes.gridworld.tables import Episodes, prior_weight_curves, tables_of
 from torchrl_priors import plots
@@ -41,13 +41,13 @@ def sample_world(cfg: GridworldConfig, seed: int) -> GridWorlds:
     return sample_worlds(torch.tensor([seed]), **{name: cfg.world[name] for name in names})  # type: ignore[index]
 
 
-def make_learner(cfg: GridworldConfig, method: str) -> learners.Learner:
+def make_learner(cfg: GridworldConfig, method: str) -> run_parts.Learner:
     """How the students of a method learn."""
     rates, budget = cfg.student.lr_weight, cfg.evaluation.points * cfg.evaluation.interval
     schedule = None
     if applies(cfg.schedule, method):
         schedule = make_schedule(cfg.schedule, budget)(torch.arange(budget + 1)).double().numpy()
-    return learners.learner_of(
+    return run_parts.learner_of(
         method,
         gamma=cfg.student.gamma,
         lr=cfg.student.lr,
@@ -71,19 +71,19 @@ class TaughtWorld:
     def __init__(self, cfg: GridworldConfig, seed: int) -> None:
         self.cfg, self.seed = cfg, seed
         self.grid = sample_world(cfg, seed)
-        self.world = learners.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
+        self.world = run_parts.World.of(self.grid, cfg.world.noise, cfg.world.end_prob)
         self.q, self.visited = self.teach()
 
     def teach(self) -> tuple[np.ndarray, np.ndarray]:
         """Action values of the teacher, ``[C, 4]``, and which states it visited, ``[C]``."""
         states, cfg = len(self.world.state), self.cfg.teacher
-        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), learners.generator(self.seed, "teacher")
+        q, visited, rng = np.zeros((states, 4)), np.zeros(states, bool), run_parts.generator(self.seed, "teacher")
         tabular.teach(self.world, q, visited, cfg.steps, float(cfg.gamma), float(cfg.lr), float(cfg.epsilon), rng)
         return q, visited
 
     def facts(self) -> dict[str, Any]:
         """What ``worlds.csv`` says about the world and its teacher."""
-        rng = learners.generator(self.seed, "teacher evaluation")
+        rng = run_parts.generator(self.seed, "teacher evaluation")
         episodes = [tabular.teacher_episode(self.world, self.q, rng) for _ in range(self.cfg.teacher.eval_episodes)]
         total, length = np.mean(episodes, 0)
         return {
@@ -94,17 +94,17 @@ class TaughtWorld:
             "reachable_goal": bool(self.grid.has_goal()),
         }
 
-    def advice(self, prior: str) -> learners.Advice:
+    def advice(self, prior: str) -> run_parts.Advice:
         """What the prior of this name says."""
-        spec = learners.parse_prior(prior or "expert")
-        return learners.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
+        spec = run_parts.parse_prior(prior or "expert")
+        return run_parts.make_advice(spec, self.q, self.visited, self.cfg.teacher.temperature, self.seed)
 
     def train(
         self,
         method: str,
         prior: str,
-        advice: learners.Advice,
-        learner: learners.Learner,
+        advice: run_parts.Advice,
+        learner: run_parts.Learner,
         *,
         watch: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -116,25 +116,25 @@ class TaughtWorld:
             self.world,
             advice,
             learner,
-            learners.new_tables(states, learner.adaptive),
+            run_parts.new_tables(states, learner.adaptive),
             self.cfg.evaluation.interval,
             log,
             weights,
             visits,
-            learners.generator(self.seed, "student", method, prior),
+            run_parts.generator(self.seed, "student", method, prior),
         )
         return log, weights, visits
 
 
 def run_world(
-    cfg: GridworldConfig, seed: int, by_method: dict[str, learners.Learner], progress: Callable[[int], Any]
+    cfg: GridworldConfig, seed: int, by_method: dict[str, run_parts.Learner], progress: Callable[[int], Any]
 ) -> dict[str, Any]:
     """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 8]``."""
     taught = TaughtWorld(cfg, seed)
     progress(cfg.teacher.steps)
     advice = {prior: taught.advice(prior) for prior in ("", *cfg.priors)}
     episodes = []
-    for method, prior in learners.runs_of(cfg.methods, cfg.priors):
+    for method, prior in run_parts.runs_of(cfg.methods, cfg.priors):
         episodes.append(taught.train(method, prior, advice[prior], by_method[method])[0].astype(np.float32))
         progress(cfg.evaluation.points * cfg.evaluation.interval)
     return {**taught.facts(), "episodes": np.stack(episodes)}
@@ -143,7 +143,7 @@ def run_world(
 def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
     """What :func:`run_world` returns, stacked over worlds; blocks of worlds are kept in ``blocks/``."""
     by_method = {method: make_learner(cfg, method) for method in cfg.methods}
-    pairs, budget = learners.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
+    pairs, budget = run_parts.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
     per_world = cfg.teacher.steps + len(pairs) * budget
     blocks = {
         f"blocks/{first:06d}": range(first, min(first + cfg.block_worlds, cfg.worlds))

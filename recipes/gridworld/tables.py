@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from recipes.gridworld.config import GridworldConfig
-from recipes.gridworld.learners import runs_of
+from recipes.gridworld.run_parts import runs_of
 from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors.methods import get_method
 from torchrl_priors.metrics import (

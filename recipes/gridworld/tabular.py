@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 if TYPE_CHECKING:  # Numba looks at the values themselves
-    from recipes.gridworld.learners import Advice, Learner, Tables, World
+    from recipes.gridworld.run_parts import Advice, Learner, Tables, World
 
 __all__ = ["LOG_FIELDS", "arrive", "best_action", "play_episode", "step", "teach", "teacher_episode", "train"]
 __all__ += ["train_episode"]

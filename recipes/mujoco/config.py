@@ -12,7 +12,17 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
 
 import recipes.common.sweeps  # noqa: F401  registers the launcher that conf/mujoco.yaml names
-from recipes.common.checks import at_least_0, check_keys, finite, one_of, positive, require, require_compiler, share
+from recipes.common.checks import (
+    at_home,
+    at_least_0,
+    check_keys,
+    finite,
+    one_of,
+    positive,
+    require,
+    require_compiler,
+    share,
+)
 from recipes.common.loggers import LOGGERS, require_logger
 from recipes.common.schedules import ScheduleConfig, check_schedule
 from torchrl_priors.methods import MethodSpec, get_method
@@ -143,7 +153,7 @@ def teachers(cfg: MujocoConfig) -> list[Path]:
     """The teachers' files."""
     path = cfg.prior.path
     several = path if isinstance(path, Sequence) and not isinstance(path, str) else [path]
-    return [] if path is None else [Path(str(one)).expanduser() for one in several]
+    return [] if path is None else [at_home("prior.path", str(one)) for one in several]
 
 
 def method_of(cfg: MujocoConfig) -> MethodSpec:

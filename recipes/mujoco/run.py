@@ -64,7 +64,7 @@ class Run:
             one = isinstance(cfg.prior.path, str)
             matters["prior"] |= {"path": names[0] if one else names, "sha256": digests[0] if one else digests}
         env = f"{cfg.env.id}-{cfg.env.version}"
-        path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}").expanduser()
+        path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}")
         self.cfg = cfg
         self.frames = 0
         self.is_to_stop = False

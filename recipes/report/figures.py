@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from recipes.report.tables import ALL, Study
 from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots.benchmark import interval_panels, profile_panels, return_curves
+from torchrl_priors.plots import curve_panels, interval_panels, profile_panels
 
 __all__ = ["TRAINING", "curve_table", "figures"]
 
@@ -129,7 +129,7 @@ def _return_curves(study: Study, curves: pd.DataFrame) -> Figure:
             panels[title][label] = ConfidenceInterval(*rows[["iqm", "ci_low", "ci_high"]].to_numpy().T)
             steps[title] = rows["frames"].to_numpy()
     options: Any = {"columns": _columns(study), "ylabel": "Evaluation return (IQM)", "baseline": _BASELINE}
-    return return_curves(panels, steps, references=teachers, **options)
+    return curve_panels(panels, steps, references=teachers, **options)
 
 
 def _training(study: Study, metric: str, name: str, differs: bool) -> Figure | None:
@@ -158,7 +158,7 @@ def _training(study: Study, metric: str, name: str, differs: bool) -> Figure | N
     if not panels:
         return None
     to = f" to {_BASELINE if study.cfg.baseline == 'none' else study.cfg.baseline}" if differs else ""
-    return return_curves(panels, steps, columns=_columns(study), ylabel=f"{name[0].upper()}{name[1:]}{to}")
+    return curve_panels(panels, steps, columns=_columns(study), ylabel=f"{name[0].upper()}{name[1:]}{to}")
 
 
 def _by_frames(study: Study, env: str, prior: str, label: str, metric: str) -> pd.DataFrame | None:

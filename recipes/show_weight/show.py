@@ -11,7 +11,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from recipes.common.checks import check_keys
-from recipes.gridworld.learners import parse_prior
+from recipes.gridworld.run_parts import parse_prior
 from recipes.gridworld.study import TaughtWorld, make_learner
 from recipes.report.runs import is_gridworld
 from torchrl_priors import plots

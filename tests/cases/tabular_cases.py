@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from recipes.gridworld import learners, tabular
+from recipes.gridworld import run_parts, tabular
 from torchrl_priors.envs import GridWorlds
 from torchrl_priors.envs.worlds import KINDS, MOVES
 from torchrl_priors.methods import get_method
@@ -46,29 +46,29 @@ class Run(NamedTuple):
     prior: str
     world_index: int
     td_error: str
-    world: learners.World
+    world: run_parts.World
     q: np.ndarray
-    advice: learners.Advice
-    learner: learners.Learner
+    advice: run_parts.Advice
+    learner: run_parts.Learner
 
 
 def make_run(method: str, prior: str, world: int = 0, td_error: str = "original", end_prob: float = 0.06) -> Run:
     q = action_values(world)
-    advice = learners.make_advice(learners.parse_prior(prior or "expert"), q, np.ones(STATES, bool), 1.5, world)
-    learner = learners.learner_of(
+    advice = run_parts.make_advice(run_parts.parse_prior(prior or "expert"), q, np.ones(STATES, bool), 1.5, world)
+    learner = run_parts.learner_of(
         method,
         lr_weight=RATES,
         td_error=td_error,
         schedule=SCHEDULE if get_method(method).annealed else None,
         **COEFFS,
     )
-    where = learners.World.of(drawn_worlds()[world : world + 1], 0.1, end_prob)
+    where = run_parts.World.of(drawn_worlds()[world : world + 1], 0.1, end_prob)
     return Run(method, prior, world, td_error, where, q, advice, learner)
 
 
-def random_tables(run: Run) -> learners.Tables:
+def random_tables(run: Run) -> run_parts.Tables:
     """In the middle of learning."""
-    tables, rng = learners.new_tables(STATES, run.learner.adaptive), np.random.default_rng(3)
+    tables, rng = run_parts.new_tables(STATES, run.learner.adaptive), np.random.default_rng(3)
     for table in (tables.logits, tables.value, tables.raw_value):
         table[:] = rng.standard_normal(table.shape)
     tables.policy[:] = np.exp(tables.logits) / np.exp(tables.logits).sum(-1, keepdims=True)
@@ -124,7 +124,7 @@ def sigmoid(value: float) -> float:
 class PlainStudent:
     """The tabular student in dictionaries and plain Python; of the compiled loop it shares only the order of draws."""
 
-    def __init__(self, run: Run, tables: learners.Tables | None = None) -> None:
+    def __init__(self, run: Run, tables: run_parts.Tables | None = None) -> None:
         self.run, self.spec = run, get_method(run.method)
         self.world = PlainWorld(run.world_index, run.world.end_prob)
         self.teacher = [np.log(softmax(values / 1.5)) for values in run.q]
@@ -224,7 +224,7 @@ class PlainStudent:
                 episode[name] += amount
         return list(episode.values())
 
-    def assert_same(self, tables: learners.Tables) -> None:
+    def assert_same(self, tables: run_parts.Tables) -> None:
         pairs = [("logits", self.logits), ("value", self.value), ("raw_value", self.raw_value)]
         for name, mine in [*pairs, ("weight_logit", self.weight_logit)]:
             expected = np.array([mine[state] for state in range(STATES)])

@@ -179,7 +179,7 @@ def test_several_teachers_obey_the_settings_of_their_loss() -> None:
 
 def test_a_bounded_teacher_of_an_unbounded_student_is_refused() -> None:
     loss = AE2RLoss(make_actor("normal"), make_actor("tanh_normal"), method="kickstart")
-    with pytest.raises(ValueError, match=r"Normal is unbounded, and the prior's TanhNormal .* std="):
+    with pytest.raises(ValueError, match=r"student's IndependentNormal and the prior's TanhNormal.* std="):
         loss(make_batch("normal"))
     AE2RLoss(make_actor("tanh_normal"), make_actor("normal"), method="kickstart")(make_batch("tanh_normal"))
 
@@ -196,7 +196,9 @@ def test_a_uniform_teacher_leaves_a_gaussian_student_alone() -> None:
 
 
 def test_advice_without_a_finite_log_probability_is_an_error_not_a_nan() -> None:
-    never = ModulePrior(nn.Sequential(nn.Linear(3, 2), nn.Threshold(math.inf, 0.0)), "probs")
+    sure = nn.Linear(3, 2)
+    sure.load_state_dict({"weight": torch.zeros(2, 3), "bias": torch.tensor([0.0, -math.inf])})
+    never = ModulePrior(sure, "logits")
     batch = make_batch().exclude("prior_log_prob", ("next", "prior_log_prob"))
     with pytest.raises(ValueError, match="not finite"):
         PriorLogProb(never, make_actor(), time_dim=0)(batch)

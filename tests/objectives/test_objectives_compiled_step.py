@@ -206,6 +206,17 @@ def test_minibatches_of_another_length():
     torch.testing.assert_close(reports[-1], torch.stack(list(expected[-1].values())), atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("method", ["none", "ae2r"])
+def test_sequences_are_taken_whole(method):
+    torch.manual_seed(1)
+    batch = make_batch("normal", batch=(12, 4))
+    indices = [torch.randperm(12)[:5] for _ in range(4)]
+    step, plain = both(method)[0][-1], both(method)[1]
+    reports, expected = step(batch, indices), plain_steps(*plain, batch, indices)
+    for report, losses in zip(reports, expected, strict=True):
+        torch.testing.assert_close(report, torch.stack(list(losses.values())), atol=1e-5, rtol=1e-4)
+
+
 def test_what_it_can_not_do_is_refused():
     loss = make_loss("normal", "none")
     with pytest.raises(TypeError, match="SGD"):

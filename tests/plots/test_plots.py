@@ -13,23 +13,23 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from torchrl_priors.methods import METHODS
+from torchrl_priors.methods import METHODS, MethodSpec
 from torchrl_priors.metrics import (
     ConfidenceInterval,
-    iqm,
     mean_confidence_interval,
     performance_profile,
     stratified_bootstrap_ci,
 )
 from torchrl_priors.plots import (
+    curve_panels,
     grid_world,
-    iqm_bars,
-    learning_curves,
+    interval_panels,
     method_color,
     method_label,
-    performance_profiles,
     prior_label,
+    profile_panels,
     save_figure,
+    style,
 )
 
 PRIORS = ["expert", "random_15", "random_30", "random_50", "structural_3", "structural_5", "structural_10"]
@@ -44,8 +44,12 @@ def ratios(runs=30, seed=0):
     return np.random.default_rng(seed).normal(scale=0.3, size=(runs, 2))
 
 
-def study(methods):
-    return {p: {m: returns(seed=i) for i, m in enumerate(methods)} for p in PRIORS}
+def bands(methods):
+    return {m: mean_confidence_interval(returns(seed=i)) for i, m in enumerate(methods)}
+
+
+def intervals(methods):
+    return {m: stratified_bootstrap_ci(ratios(seed=i)[:, 0], reps=50) for i, m in enumerate(methods)}
 
 
 def world():
@@ -85,33 +89,23 @@ def overlapping_texts(figure):
     ]
 
 
+LEARNERS = [m for m in METHODS if m != "none"]
+PLACES = {prior: (i // 4, i % 4 + (i > 3)) for i, prior in enumerate(PRIORS)}
 FIGURES = {
-    "paper": lambda: learning_curves(
-        study(["er", "e2r", "aer", "ae2r"]),
-        baseline=returns(seed=9),
-        steps=STEPS,
-        profiles={m: ratios(seed=i) for i, m in enumerate(["er", "e2r", "aer", "ae2r"])},
+    "curves": lambda: curve_panels(
+        {prior_label(p): bands(METHODS) for p in PRIORS},
+        {prior_label(p): STEPS for p in PRIORS},
+        places={prior_label(p): place for p, place in PLACES.items()},
+        share_y=True,
     ),
-    "every method": lambda: learning_curves(
-        study([m for m in METHODS if m != "none"]),
-        baseline=returns(seed=9),
-        steps=STEPS,
-        profiles={m: ratios(seed=i) for i, m in enumerate(METHODS) if m != "none"},
+    "one panel": lambda: curve_panels({"Hopper": bands(["ae2r"])}, {"Hopper": STEPS}),
+    "environments": lambda: curve_panels(
+        {f"Env-v{i}": bands(["none", "ae2r"]) for i in range(5)}, {f"Env-v{i}": 100 * STEPS for i in range(5)}
     ),
-    "one panel": lambda: learning_curves({"expert": {"ae2r": returns()}}, steps=STEPS),
-    "environments": lambda: learning_curves(
-        {f"Env-v{i}": {"ae2r": 1000 * returns()} for i in range(5)},
-        baseline={f"Env-v{i}": returns() for i in range(5)},
-        steps=100 * STEPS,
-        profiles={"ae2r": ratios()},
-        share_y=False,
-    ),
-    "profiles": lambda: performance_profiles({m: ratios() for m in METHODS if m != "none"}),
-    "bars": lambda: iqm_bars(
-        {p: {m: ratios(seed=i)[:, 0] for i, m in enumerate(METHODS) if m != "none"} for p in PRIORS}
-    ),
-    "bars of three": lambda: iqm_bars(
-        {p: {"ae2r": ratios()[:, 0]} for p in PRIORS[:3]}, reference={"expert": {"ae2r": 0.1}}
+    "profiles": lambda: profile_panels({"All priors": {m: ratios() for m in LEARNERS}}, reps=20),
+    "bars": lambda: interval_panels({prior_label(p): intervals(LEARNERS) for p in PRIORS}, columns=4),
+    "bars with a reference": lambda: interval_panels(
+        {p: intervals(["ae2r"]) for p in PRIORS[:3]}, reference={"expert": intervals(["ae2r"])}
     ),
     "world": lambda: grid_world(
         **world(),
@@ -145,10 +139,11 @@ def test_matplotlib_settings_are_left_alone(name, tmp_path):
 def test_pyplot_is_never_imported():
     code = """
 import sys
-from torchrl_priors.plots import learning_curves, save_figure
+from torchrl_priors.metrics import ConfidenceInterval
+from torchrl_priors.plots import interval_panels, save_figure
 import tempfile
 with tempfile.TemporaryDirectory() as folder:
-    save_figure(learning_curves({"expert": {"er": [[1.0, 2.0]]}}), folder + "/x")
+    save_figure(interval_panels({"expert": {"er": ConfidenceInterval(1.0, 0.5, 2.0)}}), folder + "/x")
 assert "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -157,6 +152,11 @@ assert "matplotlib.pyplot" not in sys.modules
 class TestNames:
     def test_every_method_has_a_colour_and_a_label_of_its_own(self):
         assert len({method_color(m) for m in METHODS}) == len({method_label(m) for m in METHODS}) == len(METHODS)
+
+    def test_a_preset_without_a_label_is_called_by_its_name(self, monkeypatch):
+        monkeypatch.setitem(style._METHODS, "mine", (MethodSpec("none", auxiliary=True, adaptive=False).label, ""))
+        assert method_label("mine") == "mine"
+        assert to_rgb(method_color("mine"))
 
     def test_unknown_method_keeps_its_colour(self):
         assert method_color("mine") == method_color("mine")
@@ -170,111 +170,81 @@ class TestNames:
         assert prior_label(name) == label
 
 
-class TestLearningCurves:
-    def test_line_is_the_mean_and_band_its_pointwise_interval(self):
-        curve = returns()
-        ax = learning_curves({"expert": {"ae2r": curve}}, steps=STEPS).axes[0]
-        mean, low, high = mean_confidence_interval(curve)
+class TestCurves:
+    def test_line_and_band_are_what_was_given(self):
+        mean, low, high = band = mean_confidence_interval(returns())
+        ax = curve_panels({"Hopper": {"ae2r": band}}, {"Hopper": STEPS}).axes[0]
         drawn = line(ax, method_color("ae2r"))
         np.testing.assert_array_equal(drawn.get_xdata(), STEPS)
         np.testing.assert_allclose(drawn.get_ydata(), mean)
-        band = ax.collections[0].get_paths()[0].vertices
+        edges = ax.collections[0].get_paths()[0].vertices
         for x, bottom, top in zip(STEPS, low, high, strict=True):
-            ys = band[band[:, 0] == x, 1]
+            ys = edges[edges[:, 0] == x, 1]
             np.testing.assert_allclose([ys.min(), ys.max()], [bottom, top])
 
-    def test_finished_intervals_are_drawn_as_they_are(self):
-        ready = ConfidenceInterval(np.array([1.0, 2.0, 3.0]), np.zeros(3), np.full(3, 5.0))
-        ax = learning_curves({"expert": {"er": ready}}).axes[0]
-        assert line(ax, method_color("er")).get_ydata().tolist() == [1.0, 2.0, 3.0]
-        assert line(ax, method_color("er")).get_xdata().tolist() == [1, 2, 3]
+    def test_an_interval_that_is_not_known_is_not_drawn(self):
+        mean, nothing = returns().mean(0), np.full(len(STEPS), np.nan)
+        unknown = ConfidenceInterval(mean, nothing, nothing)
+        ax = curve_panels({"Hopper": {"er": unknown}}, {"Hopper": STEPS}).axes[0]
+        np.testing.assert_allclose(line(ax, method_color("er")).get_ydata(), mean)
+        assert not [path for entry in ax.collections for path in entry.get_paths() if len(path.vertices)]
 
-    def test_papers_priors_take_the_papers_places(self):
-        figure = FIGURES["paper"]()
+    def test_panels_are_where_they_are_placed(self):
+        figure = FIGURES["curves"]()
         figure.draw_without_rendering()
-        rows = [[prior_label(p) for p in PRIORS[:4]], ["Performance profiles", *(prior_label(p) for p in PRIORS[4:])]]
-        center = {
-            title: (box.x0 + box.width / 2, box.y0)
-            for title, box in ((ax.get_title(), ax.get_position()) for ax in figure.axes)
-        }
-        for row in rows:
-            assert sorted(row, key=center.__getitem__) == row  # left to right
-        for above, below in zip(*rows, strict=True):
-            assert center[above][0] == pytest.approx(center[below][0])
-            assert center[above][1] > center[below][1]
+        for one, other in itertools.combinations(PRIORS, 2):
+            (row, column), (other_row, other_column) = PLACES[one], PLACES[other]
+            a, b = (panel(figure, prior_label(name)).get_position() for name in (one, other))
+            assert (a.y0 > b.y0 + 0.1) == (row < other_row)
+            assert (a.x0 < b.x0 - 0.1) == (column < other_column)
 
-    def test_baseline_is_dashed_black_in_every_panel(self):
-        figure = FIGURES["paper"]()
-        for prior in PRIORS:
-            base = line(panel(figure, prior_label(prior)), "black")
-            np.testing.assert_allclose(base.get_ydata(), returns(seed=9).mean(0))
-            assert base.is_dashed()
-
-    def test_baseline_may_differ_between_environments(self):
-        figure = learning_curves(
-            {"a": {"er": returns()}, "b": {"er": returns()}}, baseline={"b": returns() + 3}, share_y=False
-        )
-        assert len(panel(figure, "a").lines) == 1
-        np.testing.assert_allclose(line(panel(figure, "b"), "black").get_ydata(), returns().mean(0) + 3)
-
-    def test_legend_names_each_method_once_and_the_baseline(self):
-        labels = [text.get_text() for text in FIGURES["paper"]().legends[0].get_texts()]
-        assert labels == ["ER", "E2R", "AER", "AE2R", "Baseline"]
+    def test_the_baseline_is_dashed_and_black(self):
+        figure = FIGURES["environments"]()
+        base = line(panel(figure, "Env-v3"), "black")
+        np.testing.assert_allclose(base.get_ydata(), returns().mean(0))
+        assert base.is_dashed()
 
     def test_panels_of_one_environment_share_their_scale(self):
-        curves = {"expert": {"er": returns()}, "random_15": {"er": 100 * returns()}}
-        shared, own = learning_curves(curves), learning_curves(curves, share_y=False)
+        band = mean_confidence_interval(returns())
+        panels = {"a": {"er": band}, "b": {"er": ConfidenceInterval(*(100 * values for values in band))}}
+        steps = {"a": STEPS, "b": STEPS}
+        shared, own = curve_panels(panels, steps, share_y=True), curve_panels(panels, steps)
         assert shared.axes[0].get_ylim() == shared.axes[1].get_ylim()
         assert own.axes[0].get_ylim() != own.axes[1].get_ylim()
-
-    def test_curve_of_other_points_than_steps_is_named(self):
-        with pytest.raises(ValueError, match="'er' of 'expert'"):
-            learning_curves({"expert": {"er": returns()}}, steps=STEPS[:-1])
-
-    @pytest.mark.parametrize("nothing", [{}, {"expert": {}}])
-    def test_nothing_to_draw_is_an_error(self, nothing):
-        with pytest.raises(ValueError, match="no curves"):
-            learning_curves(nothing)
-
-    def test_arguments_are_not_changed(self):
-        curves = {"expert": {"er": returns()}}
-        learning_curves(curves, baseline=returns())
-        assert list(curves["expert"]) == ["er"]
 
 
 class TestProfiles:
     def test_line_is_the_profile_and_zero_is_marked(self):
         taus = np.linspace(-0.5, 0.5, 11)
-        ax = performance_profiles({"ae2r": ratios()}, taus).axes[0]
-        expected = performance_profile(ratios(), taus)
+        ax = profile_panels({"All": {"ae2r": ratios()}}, taus, reps=20).axes[0]
+        expected = performance_profile(ratios(), taus, reps=20)
         np.testing.assert_allclose(line(ax, method_color("ae2r")).get_ydata(), expected.estimate)
         zero = next(entry for entry in ax.lines if len(entry.get_xdata()) == 2)
         assert list(zero.get_xdata()) == [0, 0]
         assert zero.is_dashed()
 
-    def test_no_profile_is_an_error(self):
-        with pytest.raises(ValueError, match="no profiles"):
-            performance_profiles({})
+    def test_there_is_no_band_of_three_runs(self):
+        def height(runs):
+            ax = profile_panels({"All": {"er": ratios(runs)}}, reps=20).axes[0]
+            vertices = ax.collections[0].get_paths()[0].vertices
+            return max(np.ptp(vertices[vertices[:, 0] == x, 1]) for x in np.unique(vertices[:, 0]))
 
-    def test_profile_at_other_thresholds_is_named(self):
-        with pytest.raises(ValueError, match="profile of 'er'"):
-            performance_profiles({"er": performance_profile(ratios(), [0.0, 1.0])}, [0.0, 0.5, 1.0])
+        assert height(3) == 0 < height(4)
 
 
-class TestBars:
-    def test_bar_spans_the_interval_and_line_is_the_iqm(self):
-        scores = ratios()[:, 0]
-        ax = iqm_bars({"expert": {"er": scores}}).axes[0]
-        _, low, high = stratified_bootstrap_ci(scores)
+class TestIntervals:
+    def test_bar_spans_the_interval_and_line_is_the_estimate(self):
+        ax = interval_panels({"expert": {"er": ConfidenceInterval(0.2, 0.1, 0.4)}}, scale=1e3).axes[0]
         bar = ax.patches[0]
-        assert (bar.get_x(), bar.get_x() + bar.get_width()) == pytest.approx((1e3 * low, 1e3 * high))
-        assert ax.collections[0].get_segments()[0][0, 0] == pytest.approx(1e3 * iqm(scores))
+        assert (bar.get_x(), bar.get_x() + bar.get_width()) == pytest.approx((100, 400))
+        assert ax.collections[0].get_segments()[0][0, 0] == pytest.approx(200)
 
     def test_reference_is_a_marker_beside_its_method(self):
-        figure = iqm_bars(
-            {"expert": {"er": [0.1, 0.2], "ae2r": [0.3, 0.4]}},
-            reference={"expert": {"ae2r": ConfidenceInterval(0.036, 0.025, 0.05)}, "other": {"er": 1.0}},
+        figure = interval_panels(
+            {"expert": {"er": ConfidenceInterval(0.1, 0.0, 0.2), "ae2r": ConfidenceInterval(0.3, 0.2, 0.4)}},
+            reference={"expert": {"ae2r": ConfidenceInterval(0.036, 0.025, 0.05)}, "other": {}},
             reference_label="Published",
+            scale=1e3,
         )
         marker = next(entry for entry in figure.axes[0].lines if entry.get_marker() == "D")
         assert (marker.get_xdata()[0], marker.get_ydata()[0]) == (pytest.approx(36), 1)
@@ -282,19 +252,16 @@ class TestBars:
 
     @pytest.mark.parametrize("value", [0.5, -0.5])
     def test_zero_and_every_bar_are_in_view(self, value):
-        ax = iqm_bars({"expert": {"er": ConfidenceInterval(value, value - 0.1, value + 0.1)}}).axes[0]
+        ax = interval_panels({"expert": {"er": ConfidenceInterval(value, value - 0.1, value + 0.1)}}).axes[0]
         left, right = ax.get_xlim()
-        assert left < min(0, 1e3 * (value - 0.1)) < max(0, 1e3 * (value + 0.1)) < right
+        assert left < min(0, value - 0.1) < max(0, value + 0.1) < right
 
     def test_method_missing_for_a_prior_leaves_its_row_empty(self):
-        figure = iqm_bars({"expert": {"er": [0.1], "ae2r": [0.2]}, "random_15": {"ae2r": [0.3]}})
+        one = ConfidenceInterval(0.1, 0.0, 0.2)
+        figure = interval_panels({"expert": {"er": one, "ae2r": one}, "random_15": {"ae2r": one}})
         bar = figure.axes[1].patches[0]
         assert len(figure.axes[1].patches) == 1
         assert bar.get_y() + bar.get_height() / 2 == pytest.approx(1)
-
-    def test_nothing_to_draw_is_an_error(self):
-        with pytest.raises(ValueError, match="no scores"):
-            iqm_bars({"expert": {}})
 
 
 class TestSave:

@@ -52,7 +52,9 @@ def run(command: str, folder: Path) -> int | str | None:
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
         patch.setattr(sys, "argv", [words[2], *words[3:], *SHORT[words[2]].split(), *more])
         try:
-            importlib.import_module(words[2]).main()
+            package = importlib.import_module(words[2])
+            command_of = importlib.import_module(f"{words[2]}.__main__") if hasattr(package, "__path__") else package
+            command_of.main()
         except SystemExit as end:
             return end.code
     return None

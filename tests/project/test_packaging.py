@@ -1,10 +1,15 @@
-"""The core stands without the extras."""
+"""The core stands without the extras, and the wheel holds the library only."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
+import pytest
+
+ROOT = Path(__file__).parents[2]
 EXTRAS = ("gymnasium", "hydra", "matplotlib", "mujoco", "omegaconf", "pandas", "rliable", "safetensors", "tqdm")
 
 IMPORT_WITHOUT = """
@@ -21,3 +26,13 @@ def test_every_public_name_imports_without_the_extras() -> None:
     code = IMPORT_WITHOUT.format(extras=EXTRAS)
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
+
+
+def test_the_wheel_holds_the_library_and_nothing_else(tmp_path: Path) -> None:
+    wheel = pytest.importorskip("hatchling.builders.wheel")
+    (path,) = wheel.WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    packages = {name.split("/")[0] for name in names if ".dist-info/" not in name}
+    assert packages == {"torchrl_priors"}
+    assert "torchrl_priors/py.typed" in names

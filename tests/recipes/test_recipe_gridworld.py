@@ -17,7 +17,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from recipes.gridworld.__main__ import main
-from recipes.gridworld.learners import runs_of
+from recipes.gridworld.run_parts import runs_of
 from recipes.gridworld.study import open_folder
 from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors.methods import METHODS

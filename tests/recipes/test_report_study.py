@@ -73,7 +73,7 @@ def test_the_teachers_return_is_a_line_where_a_table_tells_it(tables, tmp_path, 
         tables.with_name("deep_teachers.csv"), index=False
     )
     drawn = {}
-    monkeypatch.setattr(figures, "return_curves", lambda *args, **options: drawn.update(options) or Figure())
+    monkeypatch.setattr(figures, "curve_panels", lambda *args, **options: drawn.update(options) or Figure())
     report(config(tables, tmp_path / "out"))
     levels = drawn["references"]
     assert list(levels.values()) == [{"teacher": 333.0}]

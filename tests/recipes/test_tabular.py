@@ -9,19 +9,19 @@ import pytest
 import torch
 from tabular_cases import PRIORS, STATES, PlainStudent, PlainWorld, action_values, drawn_worlds, make_run, random_tables
 
-from recipes.gridworld import learners, tabular
+from recipes.gridworld import run_parts, tabular
 from torchrl_priors.envs import GridMaps, transition
 from torchrl_priors.methods import METHODS, get_method
 
 POINTS, INTERVAL = 5, 30
-PAIRS = learners.runs_of(list(METHODS), PRIORS)
+PAIRS = run_parts.runs_of(list(METHODS), PRIORS)
 
 
 def train(run, points=POINTS, interval=INTERVAL, *, watch=False, seed=1):
-    tables, log = learners.new_tables(STATES, run.learner.adaptive), np.zeros((points, len(tabular.LOG_FIELDS)))
+    tables, log = run_parts.new_tables(STATES, run.learner.adaptive), np.zeros((points, len(tabular.LOG_FIELDS)))
     weights = np.zeros((points if watch else 0, STATES))
     visits = np.zeros(weights.shape, np.int64)
-    rng = learners.generator(seed, run.method, run.prior)
+    rng = run_parts.generator(seed, run.method, run.prior)
     tabular.train(run.world, run.advice, run.learner, tables, interval, log, weights, visits, rng)
     return tables, log, weights, visits
 
@@ -32,7 +32,7 @@ def test_student_does_and_learns_what_plain_python_does(method, prior, td_error)
     for world in range(3):
         run = make_run(method, prior, world, td_error)
         tables, log, _, _ = train(run)
-        plain, rng, evaluations = PlainStudent(run), learners.generator(1, method, prior), []
+        plain, rng, evaluations = PlainStudent(run), run_parts.generator(1, method, prior), []
         while len(evaluations) < POINTS:
             if plain.steps < (len(evaluations) + 1) * INTERVAL:
                 plain.train_episode(rng)
@@ -48,7 +48,7 @@ def test_student_does_and_learns_what_plain_python_does(method, prior, td_error)
 def test_episode_that_begins_where_the_last_one_ended_sees_what_that_taught(method):
     run = make_run(method, "structural_3", end_prob=1.0)  # every episode is one step from the start
     tables, plain, steps = random_tables(run), PlainStudent(run, random_tables(run)), 0
-    rng, same = learners.generator(0), learners.generator(0)
+    rng, same = run_parts.generator(0), run_parts.generator(0)
     for _ in range(30):
         steps = tabular.train_episode(run.world, run.advice, run.learner, tables, steps, rng)
         plain.train_episode(same)
@@ -60,7 +60,7 @@ def test_evaluation_teaches_nothing():
     run = make_run("ae2r", "structural_3")
     tables, log = random_tables(run), np.zeros(len(tabular.LOG_FIELDS))
     before = [table.copy() for table in tables]
-    tabular.play_episode(run.world, run.advice, tables, log, learners.generator(0))
+    tabular.play_episode(run.world, run.advice, tables, log, run_parts.generator(0))
     assert log[1] > 0
     assert all(np.array_equal(table, copy) for table, copy in zip(tables, before, strict=True))
 
@@ -97,8 +97,8 @@ def test_runs_differ_and_threads_do_not_matter():
 
 def test_random_numbers_are_of_the_seed_and_the_names():
     seeds = [(seed, *names) for seed in (0, 1, 2**61) for names in ((), ("student",), ("student", "er"), ("er",))]
-    assert len({learners.generator(*seed).random() for seed in seeds}) == len(seeds)
-    assert learners.generator(7, "a").random(3).tolist() == learners.generator(7, "a").random(3).tolist()
+    assert len({run_parts.generator(*seed).random() for seed in seeds}) == len(seeds)
+    assert run_parts.generator(7, "a").random(3).tolist() == run_parts.generator(7, "a").random(3).tolist()
 
 
 def test_the_loops_step_is_that_of_the_environment():
@@ -110,7 +110,7 @@ def test_the_loops_step_is_that_of_the_environment():
     theirs = transition(maps, position, action, *draws, noise=noise, end_prob=end_prob)
     assert set(theirs[1].unique().tolist()) == {0.0, 10.0, -10.0, 5.0, -5.0, 1.0, -1.0}
     for world in range(3):
-        here = learners.World.of(worlds[world : world + 1], noise, end_prob)
+        here = run_parts.World.of(worlds[world : world + 1], noise, end_prob)
         for cell in range(STATES):
             for move in range(4):
                 for draw in range(20):
@@ -122,9 +122,9 @@ def test_the_loops_step_is_that_of_the_environment():
 
 def test_choice_follows_the_softmax():
     run = make_run("none", "")
-    tables = learners.new_tables(STATES, False)
+    tables = run_parts.new_tables(STATES, False)
     tables.policy[:] = policy = [0.4, 0.1, 0.3, 0.2]
-    rng = learners.generator(0)
+    rng = run_parts.generator(0)
     chosen = [tabular.arrive(run.world, 0, run.advice, tables, rng)[1] for _ in range(10_000)]
     np.testing.assert_allclose(np.bincount(chosen, minlength=4) / 10_000, policy, atol=0.025)
 
@@ -139,9 +139,9 @@ def test_teacher_learns_what_plain_python_learns():
     for world in range(3):
         run, steps = make_run("none", "", world), 1500
         q, visited = np.zeros((STATES, 4)), np.zeros(STATES, bool)
-        tabular.teach(run.world, q, visited, steps, 0.95, 0.1, 0.2, learners.generator(world, "teacher"))
+        tabular.teach(run.world, q, visited, steps, 0.95, 0.1, 0.2, run_parts.generator(world, "teacher"))
         plain, table, met = PlainWorld(world, 0.06), np.zeros((STATES, 4)), set()
-        rng, cell = learners.generator(world, "teacher"), plain.start
+        rng, cell = run_parts.generator(world, "teacher"), plain.start
         for _ in range(steps):
             state = plain.state[cell]
             met.add(state)
@@ -160,8 +160,8 @@ def test_teacher_learns_what_plain_python_learns():
 
 
 def test_teachers_episode_is_greedy():
-    run, rng = make_run("none", "", 1), learners.generator(0)
-    plain, same, q = PlainWorld(1, 0.06), learners.generator(0), action_values(1)
+    run, rng = make_run("none", "", 1), run_parts.generator(0)
+    plain, same, q = PlainWorld(1, 0.06), run_parts.generator(0), action_values(1)
     for _ in range(20):
         cell, done, total, length = plain.start, False, 0.0, 0
         while not done:

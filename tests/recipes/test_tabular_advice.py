@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipes.gridworld.learners import make_advice, parse_prior, runs_of
+from recipes.gridworld.run_parts import make_advice, parse_prior, runs_of
 from torchrl_priors.priors import BoltzmannPrior
 
 MANY = 10_000

@@ -12,7 +12,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import ReinforceLoss
 from torchrl.objectives.value import TD0Estimator
 
-from recipes.gridworld import learners, tabular
+from recipes.gridworld import run_parts, tabular
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.methods import METHODS, get_method
 from torchrl_priors.objectives import AE2RLoss
@@ -49,7 +49,7 @@ def as_batch(visits: list[Visit]) -> TensorDict:
 class Student:
     """The tabular student of one run, out of the library's modules and TorchRL's."""
 
-    def __init__(self, run: Run, tables: learners.Tables) -> None:
+    def __init__(self, run: Run, tables: run_parts.Tables) -> None:
         method, prior, td_error, self.spec = run.method, run.prior, run.td_error, get_method(run.method)
         coeffs = {name: COEFFS[name] for name in ("bonus_coeff", "aux_coeff", "gamma")}
         self.logits, self.value, self.raw_value = (
@@ -142,8 +142,8 @@ def test_compiled_study_and_modules_give_the_same_update(method, prior, td_error
     student, witness, lengths, steps = Student(run, tables), PlainStudent(run, tables), [], 0
     before, rng, same = (
         student.tables(),
-        learners.generator(5, method, prior),
-        learners.generator(5, method, prior),
+        run_parts.generator(5, method, prior),
+        run_parts.generator(5, method, prior),
     )
     for _ in range(6):
         visits = witness.train_episode(same)  # says what the loop does next

@@ -13,10 +13,11 @@ from tensordict import NestedKey
 from torchrl.data import TensorSpec
 
 from torchrl_priors.artifacts.errors import ArtifactError
-from torchrl_priors.artifacts.format import pack, read, write_atomically
+from torchrl_priors.artifacts.format import pack, read
 from torchrl_priors.artifacts.manifest import PriorManifest, parse_manifest
 from torchrl_priors.artifacts.prior import build_prior, describe_prior
 from torchrl_priors.artifacts.spaces import check_spaces
+from torchrl_priors.atomic import write_atomically
 from torchrl_priors.priors import Prior
 
 __all__ = ["load_prior", "read_manifest", "save_prior"]

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import re
-import secrets
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from torchrl_priors.artifacts.errors import ArtifactError, short
 
-__all__ = ["KIND", "pack", "read", "write_atomically"]
+__all__ = ["KIND", "pack", "read"]
 
 KIND = "torchrl_priors.prior"
 _VERSION = 2
@@ -53,25 +52,6 @@ def pack(tensors: dict[str, Tensor], manifest: Any, *, version: Any = _VERSION) 
 def _seal(data: bytes) -> bytes:
     """Puts the digest of the file, in which the digest's own place is zeros, into that place."""
     return data.replace(_NO_DIGEST.encode(), hashlib.sha256(data).hexdigest().encode(), 1)
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Writes a file that appears under its name when it is complete, or not at all.
-
-    Raises:
-        FileNotFoundError: its folder does not exist.
-    """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"No folder {path.parent} to write {path.name} in.")
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    try:
-        with partial.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], Any]:

@@ -21,6 +21,7 @@ from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.priors import Prior
 
 from .networks_loss import NetworksLoss
+from .selected import SelectedOutput
 from .terms import AuxiliaryTerm, Found, RawCriticTerm, Term, WeightTerm
 
 __all__ = ["AE2RLoss"]
@@ -30,7 +31,7 @@ _LOSSES = {"loss_prior_critic": "critic_coeff", "loss_prior_weight": "weight_coe
 _LOGS = ("prior_kl", "prior_cross_entropy", "prior_td_error", "prior_weight", "prior_bonus")
 
 
-class AE2RLoss(NetworksLoss):
+class AE2RLoss(SelectedOutput, NetworksLoss):
     r"""Auxiliary loss and prior-weight loss of (adaptive) entropy regularisation towards a soft action prior.
 
     Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer". It stands beside any policy-gradient loss and
@@ -206,7 +207,6 @@ class AE2RLoss(NetworksLoss):
                 f"prior_in_batch=True needs a Prior, got {type(prior).__name__}: ActionPrior(policy) makes it one."
             )
 
-        self._out_keys: list[NestedKey] | None = None
         super().__init__(functional=functional)
         self.spec = spec
         self.td_error = td_error
@@ -253,7 +253,7 @@ class AE2RLoss(NetworksLoss):
 
     @property
     def teachers(self) -> list[AE2RLoss]:
-        """The loss of each teacher: this one."""
+        """This loss, which is that of its one teacher."""
         return [self]
 
     @property
@@ -264,19 +264,15 @@ class AE2RLoss(NetworksLoss):
     @property
     def out_keys(self) -> list[NestedKey]:
         """What this instance writes, losses first (``prior_bonus`` comes on top if the batch has it)."""
-        if self._out_keys is None:
-            written = {key for term in self.terms for key in term.out_keys}
-            return [key for key in (*_LOSSES, *_LOGS) if key in written]
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
+        if self._selected is not None:
+            return self._selected
+        written = {key for term in self.terms for key in term.out_keys}
+        return [key for key in (*_LOSSES, *_LOGS) if key in written]
 
     @dispatch(auto_batch_size=False)  # no guess from the shapes: a single observation has no trailing 1 to tell by
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch of any batch size, and what is worth logging; the batch is left as it is."""
-        return self.losses_of(tensordict)
+        return self.only_selected(self.losses_of(tensordict))
 
     def losses_of(self, tensordict: TensorDictBase, dist: d.Distribution | None = None) -> TensorDictBase:
         """See :meth:`forward`; ``dist`` is the student's distribution, if it is at hand."""

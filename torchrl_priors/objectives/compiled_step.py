@@ -104,6 +104,7 @@ class CompiledStep:
         self.names = []
         self._select = select if select is not None else lambda name: name.startswith("loss_")
         self._backend = backend
+        self._rest: tuple[int, ...] = ()  # of the batch, behind the dimension that is indexed
         self._graphs: dict[Hashable, Callable[[list[Tensor]], Tensor]] = {}
         self._reached: dict[Hashable, list[list[Tensor]]] = {}
 
@@ -112,12 +113,14 @@ class CompiledStep:
         """Take a step on ``batch[index]`` for each of the indices, in turn.
 
         Args:
-            batch (TensorDictBase): ``[N]``, with the entries that the loss reads and few others.
+            batch (TensorDictBase): ``[N]``, or ``[N, T]`` of which sequences are taken, with the entries that the
+                loss reads and few others.
             indices (iterable of Tensor): integers, ``[M]`` each. Each length is recorded and compiled apart.
 
         Returns:
             Tensor: the means of all that the loss puts out, ``[steps, len(names)]``; :attr:`names` says what they are.
         """
+        self._rest = tuple(batch.batch_size[1:])
         keys = tuple(sorted(batch.keys(True, True), key=str))  # one graph whatever their order, also on disk
         values = [batch.get(key).contiguous() for key in keys]
         flats: list[FlatParameters] = []
@@ -129,7 +132,7 @@ class CompiledStep:
                 others = [tensor for tensor in tensors_of(self.loss) if id(tensor) not in trained]
                 state = [tensor for flat in flats for tensor in flat.buffers]
                 constants = [*(tensor.detach() for tensor in others), *values]
-                layout = (keys, *(flat.layout for flat in flats), *map(layout_of, constants))
+                layout = (self._rest, keys, *(flat.layout for flat in flats), *map(layout_of, constants))
             which = (layout, layout_of(index))
             factors = torch.tensor([flat.factors(len(reports) + 1) for flat in flats], device=index.device)
             inputs = [*state, factors, *constants, index]
@@ -143,7 +146,7 @@ class CompiledStep:
     def _flatten(self, keys: tuple[NestedKey, ...], values: list[Tensor], index: Tensor) -> list[FlatParameters]:
         """The parameters that the losses reach and Adam's state of them, each group in one piece or few."""
         groups = self.optimizer.param_groups
-        which = (keys, tuple(parameter.requires_grad for group in groups for parameter in group["params"]))
+        which = (self._rest, keys, tuple(parameter.requires_grad for group in groups for parameter in group["params"]))
         if which not in self._reached:
             self._reached[which] = self._find_reached(keys, values, index)
         flats = []
@@ -172,7 +175,7 @@ class CompiledStep:
         self, keys: tuple[NestedKey, ...], values: list[Tensor], index: Tensor, leaves: list[Tensor]
     ) -> tuple[dict[str, Tensor], list[Tensor | None]]:
         """The loss of a minibatch, and the gradient of what is to be minimised."""
-        minibatch = TensorDict({}, [len(index)])
+        minibatch = TensorDict({}, [len(index), *self._rest])
         for key, value in zip(keys, values, strict=True):
             minibatch.set(key, value.index_select(0, index))
         with torch.enable_grad():

@@ -17,11 +17,12 @@ from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import Prior
 
 from .ae2r import AE2RLoss
+from .selected import SelectedOutput
 
 __all__ = ["MultiTeacherLoss"]
 
 
-class MultiTeacherLoss(LossModule):
+class MultiTeacherLoss(SelectedOutput, LossModule):
     r"""An :class:`AE2RLoss` for each of several teachers, with one prior weight :math:`\omega_k(s)` per teacher.
 
     .. math::
@@ -127,6 +128,8 @@ class MultiTeacherLoss(LossModule):
     @property
     def out_keys(self) -> list[NestedKey]:
         """What this instance writes."""
+        if self._selected is not None:
+            return self._selected
         return list(dict.fromkeys(self._name(key, loss) for loss in self.teachers for key in loss.out_keys))
 
     def _name(self, key: str, loss: AE2RLoss) -> str:
@@ -135,7 +138,7 @@ class MultiTeacherLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a batch, and what is worth logging; the batch is left as it is."""
-        return self.losses_of(tensordict)
+        return self.only_selected(self.losses_of(tensordict))
 
     def losses_of(self, tensordict: TensorDictBase, dist: d.Distribution | None = None) -> TensorDictBase:
         """See :meth:`forward`; ``dist`` is the student's distribution, if it is at hand."""

@@ -12,13 +12,16 @@ from tensordict.utils import NestedKey
 from torch import distributions as d
 from torchrl.objectives import ClipPPOLoss
 
+from torchrl_priors.keys import read, under_next
+
 from .ae2r import AE2RLoss
 from .multi_teacher import MultiTeacherLoss
+from .selected import SelectedOutput
 
 __all__ = ["ClipPPOPriorLoss"]
 
 
-class ClipPPOPriorLoss(ClipPPOLoss):
+class ClipPPOPriorLoss(SelectedOutput, ClipPPOLoss):
     r"""Clipped PPO towards soft action priors: :class:`~torchrl.objectives.ClipPPOLoss` and :class:`AE2RLoss` in one.
 
     Centa & Preux, "Soft Action Priors: Towards Robust Policy Transfer": :math:`\mathcal L_\pi + \mathcal L_V +
@@ -91,7 +94,6 @@ class ClipPPOPriorLoss(ClipPPOLoss):
     tensor_keys: _AcceptedKeys
     prior_loss: AE2RLoss | MultiTeacherLoss
     _in_keys: list[NestedKey] | None
-    _out_keys: list[NestedKey] | None
     _student: d.Distribution | None = None  # during a forward pass
 
     def __init__(
@@ -158,24 +160,24 @@ class ClipPPOPriorLoss(ClipPPOLoss):
     @property
     def out_keys(self) -> list[NestedKey]:
         """Those of ClipPPOLoss, then those of the prior's loss."""
-        if self._out_keys is None:
-            self._out_keys = [*super().out_keys, *self.prior_loss.out_keys]
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
+        if self._selected is not None:
+            return self._selected
+        return [*super().out_keys, *self.prior_loss.out_keys]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The losses of a minibatch, and what is worth logging."""
+        if tensordict.get(self.tensor_keys.advantage, None) is None:  # it is estimated on the way
+            shaped = self.prior_loss.spec.bonus != "none"
+            hint = "run prior_transforms(loss) on the batch" if shaped else "an environment writes it"
+            read(tensordict, under_next(self.tensor_keys.reward), f"{hint}, then the value estimator")
         if self.prior_loss.reduction != self.reduction:
             self.prior_loss.reduction = self.reduction
         if self.prior_loss.loss_mask_key != self.loss_mask_key:
             self.prior_loss.loss_mask_key = self.loss_mask_key
         try:
             out = super().forward(tensordict)
-            return out.update(self.prior_loss.losses_of(tensordict, self._student))
+            return self.only_selected(out.update(self.prior_loss.losses_of(tensordict, self._student)))
         finally:
             self._student = None
 

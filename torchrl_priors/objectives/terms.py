@@ -12,9 +12,10 @@ from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives.utils import distance_loss
 
+from torchrl_priors.advice import check_advice
 from torchrl_priors.distributions import cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
 from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
-from torchrl_priors.keys import keep_where, read, under_next
+from torchrl_priors.keys import next_step, read, under_next
 
 if TYPE_CHECKING:
     from torchrl_priors.objectives.ae2r import AE2RLoss
@@ -26,6 +27,7 @@ Found = dict[str, Tensor]
 #: The student's H^X(pi || pi0), where the auxiliary loss may be another one.
 STUDENT_CROSS_ENTROPY = "student_cross_entropy"
 HINT = "run PriorLogProb on it before the loss, or rename it by set_keys"
+OF_ENVIRONMENT = "an environment writes it, or rename it by set_keys"
 
 
 class Term(ABC):
@@ -84,8 +86,7 @@ class AuxiliaryTerm(Term):
             prior_dist = self._prior_dist(tensordict)
         with contextlib.nullcontext() if loss.spec.auxiliary else torch.no_grad():
             if dist is None:
-                with loss.params_of("actor_network"):
-                    dist = loss.actor_network.get_dist(tensordict.copy())
+                dist = self._student_dist(tensordict)
             entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=samples)
             pull = entropy
             if loss.spec.cross_entropy == "teacher":
@@ -93,11 +94,21 @@ class AuxiliaryTerm(Term):
             elif loss.kl_share is not None:
                 divergence = kl_divergence(dist, prior_dist, num_samples=samples)
                 pull = torch.lerp(entropy, divergence, loss.kl_share)
+        used = pull + entropy if loss.spec.adaptive and loss.weight_target == "advantage" else pull
+        # a teacher that rules actions out may be pulled to, at an infinite divergence, but none is at NaN
+        check_advice(torch.where(kl.isnan(), kl, used.detach()), prior_dist, dist)
         ndim = tensordict.ndim or entropy.ndim  # what dispatch makes has no batch size
         found["prior_kl"], found[STUDENT_CROSS_ENTROPY] = joint(kl, ndim), joint(entropy, ndim)
         found["prior_cross_entropy"] = joint(pull, ndim)
         if loss.spec.auxiliary:
             found["loss_prior"] = found["prior_cross_entropy"]
+
+    def _student_dist(self, tensordict: TensorDictBase) -> d.Distribution:
+        try:
+            with self.loss.params_of("actor_network"):
+                return self.loss.actor_network.get_dist(tensordict.copy())
+        except ValueError as error:
+            raise ValueError(f"The student's distribution can not be built: {error}") from error
 
     def _prior_dist(self, tensordict: TensorDictBase) -> d.Distribution:
         prior = self.loss.prior
@@ -125,11 +136,20 @@ class RawCriticTerm(Term):
     def __call__(self, tensordict: TensorDictBase, found: Found, dist: d.Distribution | None) -> None:
         """The TD error has no gradient."""
         loss, names = self.loss, self.loss.tensor_keys
-        reward, terminated = (read(tensordict, under_next(key), HINT) for key in (names.reward, names.terminated))
+        reward, terminated = (
+            read(tensordict, under_next(key), OF_ENVIRONMENT) for key in (names.reward, names.terminated)
+        )
         with contextlib.nullcontext() if loss.trains_critic else torch.no_grad():
             value = loss.evaluate("critic_network", tensordict, names.value)
+        if not value.shape == reward.shape == terminated.shape:
+            raise ValueError(
+                f"The value of the critic_network, the reward {under_next(names.reward)!r} and"
+                f" {under_next(names.terminated)!r} must have one shape [*B, 1] (a value for each agent has no TD error"
+                f" here), got {tuple(value.shape)}, {tuple(reward.shape)} and {tuple(terminated.shape)}."
+            )
         with torch.no_grad():
-            next_value = loss.evaluate("critic_network", tensordict.get("next"), names.value)
+            following = next_step(tensordict, loss.critic_network.in_keys, terminated)
+            next_value = loss.evaluate("critic_network", following, names.value)
             target = td_residual(torch.zeros_like(next_value), reward, next_value, terminated, loss.gamma)
             found["prior_td_error"] = target - value
         if loss.trains_critic:
@@ -197,11 +217,10 @@ class WeightTerm(Term):
 
     def _regress_at_the_next_state(self, tensordict: TensorDictBase, found: Found) -> None:
         loss, names = self.loss, self.loss.tensor_keys
-        terminated = read(tensordict, under_next(names.terminated), HINT)
+        terminated = read(tensordict, under_next(names.terminated), OF_ENVIRONMENT)
         signal = prior_bonus(loss.bonus_coeff, read(tensordict, under_next(names.prior_log_prob), HINT))
         signal = torch.where(terminated, torch.zeros_like(signal), signal)
-        # what follows an end may be no observation (NaN where environments reset themselves)
-        weight = self._weight(keep_where(~terminated, tensordict.get("next").select(*loss.prior_weight.in_keys)))
+        weight = self._weight(next_step(tensordict, loss.prior_weight.in_keys, terminated))
         found["loss_prior_weight"] = _regression(-found["prior_td_error"], weight, signal)
         if loss.spec.auxiliary:
             with torch.no_grad():

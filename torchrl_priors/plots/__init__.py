@@ -5,21 +5,20 @@ that it works in a job without a display and in a notebook alike (but one figure
 shared by all threads while a figure is made). Needs matplotlib (``pip install torchrl-priors[recipes]``).
 """
 
-from torchrl_priors.plots.curves import learning_curves, performance_profiles
 from torchrl_priors.plots.grid import grid_world
-from torchrl_priors.plots.intervals import iqm_bars
+from torchrl_priors.plots.panels import curve_panels, interval_panels, profile_panels
 from torchrl_priors.plots.style import method_color, method_label, prior_label, save_figure
 from torchrl_priors.plots.weights import episode_weights, weight_curves, weight_maps
 
 __all__ = [
+    "curve_panels",
     "episode_weights",
     "grid_world",
-    "iqm_bars",
-    "learning_curves",
+    "interval_panels",
     "method_color",
     "method_label",
-    "performance_profiles",
     "prior_label",
+    "profile_panels",
     "save_figure",
     "weight_curves",
     "weight_maps",

@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import os
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
@@ -14,8 +13,8 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.lines import Line2D
 
+from torchrl_priors.atomic import write_atomically
 from torchrl_priors.methods import METHODS
 
 __all__ = ["method_color", "method_label", "prior_label", "save_figure"]
@@ -71,6 +70,7 @@ BASELINE = "none"
 
 #: The trial is no method of a loss: the recipe's name for finding out which one to use.
 _METHODS = {name: (spec.label, spec.color) for name, spec in METHODS.items()} | {"trial": ("Trial", "#117733")}
+_UNNAMED = ("", "")
 _OTHER_COLORS = ("#44AA99", "#DDCC77", "#AA4499", "#661100")
 
 
@@ -81,7 +81,7 @@ def method_label(name: str) -> str:
         >>> method_label("ae2r"), method_label("mine")
         ('AE2R', 'mine')
     """
-    return _METHODS[name][0] if name in _METHODS else name
+    return _METHODS.get(name, _UNNAMED)[0] or name
 
 
 def method_color(name: str) -> str:
@@ -91,9 +91,7 @@ def method_color(name: str) -> str:
         >>> method_color("none"), method_color("ae2r")
         ('#000000', '#0072B2')
     """
-    if name in _METHODS:
-        return _METHODS[name][1]
-    return _OTHER_COLORS[sum(name.encode()) % len(_OTHER_COLORS)]
+    return _METHODS.get(name, _UNNAMED)[1] or _OTHER_COLORS[sum(name.encode()) % len(_OTHER_COLORS)]
 
 
 def prior_label(name: str) -> str:
@@ -127,36 +125,6 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(
         figsize=(width, height), layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03, wspace=0.03, hspace=0.03)
     )
-
-
-_PAPER_ROWS = (
-    ("expert", "random_15", "random_30", "random_50"),
-    (None, "structural_3", "structural_5", "structural_10"),
-)
-
-
-def panel_positions(
-    names: Sequence[str], extra: bool
-) -> tuple[int, int, list[tuple[int, int]], tuple[int, int] | None]:
-    """Where to put a panel per name, and one more where ``extra``: rows, columns, positions, position of the extra one.
-
-    The paper's seven priors take the paper's places (expert prior top left, one row per kind of degradation, quality
-    falling to the right); anything else fills rows of up to four.
-    """
-    if {name for row in _PAPER_ROWS for name in row if name} == set(names):
-        place = {name: (r, c) for r, row in enumerate(_PAPER_ROWS) for c, name in enumerate(row) if name}
-        return 2, 4, [place[name] for name in names], (1, 0)
-    count = len(names) + extra
-    rows = -(-count // 4)
-    columns = -(-count // rows)
-    cells = [divmod(index, columns) for index in range(rows * columns)]
-    free = cells[len(names) :]
-    return rows, columns, cells[: len(names)], (free[0] if free else None)
-
-
-def method_handles(methods: Iterable[str]) -> list[Line2D]:
-    """Legend entries: a line in each method's colour, dashed for the baseline."""
-    return [Line2D([], [], label=method_label(method), **line_style(method)) for method in methods]
 
 
 def line_style(method: str) -> dict[str, Any]:
@@ -226,7 +194,7 @@ def save_figure(
     written = []
     for suffix, content in zip(formats, _pictures(figure, formats, dpi), strict=True):
         file = target.with_name(f"{target.name}.{suffix}")
-        _replace(file, content)
+        write_atomically(file, content)
         written.append(file)
     return written
 
@@ -250,15 +218,3 @@ def _pictures(figure: Figure, formats: Sequence[str], dpi: int) -> Iterator[byte
             yield buffer.getvalue()
     finally:
         figure.set_layout_engine(engine)
-
-
-def _replace(file: Path, content: bytes) -> None:
-    handle, temporary = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(file)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -12,7 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from torchrl_priors.plots.style import _replace
+from torchrl_priors.atomic import write_atomically
 
 __all__ = ["write_weight_video"]
 
@@ -71,7 +71,7 @@ def write_weight_video(
     )
     file = Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    _replace(file, buffer.getvalue())
+    write_atomically(file, buffer.getvalue())
     return file
 
 

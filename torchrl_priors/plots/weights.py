@@ -17,11 +17,9 @@ from torchrl_priors.plots.style import (
     TEXT_WIDTH,
     line_style,
     method_color,
-    method_handles,
     method_label,
     new_figure,
     outer_labels,
-    panel_positions,
     paper_style,
     prior_label,
     thousands,
@@ -112,12 +110,13 @@ def weight_curves(curves: Mapping[str, Mapping[str, tuple[Any, Any]]], steps: An
     steps = np.asarray(steps, np.float64)
     if not any(curves.values()):
         raise ValueError("weight_curves needs at least one curve.")
-    rows, columns, positions, _ = panel_positions(list(curves), extra=False)
+    columns = min(len(curves), 4)
+    rows = -(-len(curves) // columns)
     figure = new_figure(TEXT_WIDTH, 0.35 + 1.65 * rows)
     grid = figure.add_gridspec(rows, columns)
     axes: dict[tuple[int, int], Axes] = {}
-    for (prior, by_method), place in zip(curves.items(), positions, strict=True):
-        ax = axes[place] = figure.add_subplot(grid[place])
+    for number, (prior, by_method) in enumerate(curves.items()):
+        ax = axes[divmod(number, columns)] = figure.add_subplot(grid[divmod(number, columns)])
         for method, means in by_method.items():
             for values, style in zip(means, (_DASHED, "-"), strict=True):
                 values = np.asarray(values, np.float64)
@@ -133,7 +132,8 @@ def weight_curves(curves: Mapping[str, Mapping[str, tuple[Any, Any]]], steps: An
         Line2D([], [], color="0.3", label="Other states"),
         Line2D([], [], color="0.3", linestyle=_DASHED, label="Degraded states"),
     ]
-    handles = [*method_handles(methods), *kinds]
+    lines = [Line2D([], [], label=method_label(method), **line_style(method)) for method in methods]
+    handles = [*lines, *kinds]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), columnspacing=1.4, handlelength=1.8)
     return figure
 

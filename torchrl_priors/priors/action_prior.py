@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,8 +17,11 @@ from tensordict.nn import (
 from tensordict.nn.distributions import Delta as TensorDictDelta
 from torch import Tensor
 from torch import distributions as d
-from torchrl.modules import Delta
+from torch.compiler import is_compiling
+from torchrl.modules import Delta, TanhDelta
 
+from torchrl_priors.advice import parameter_fault
+from torchrl_priors.distributions import without_independent
 from torchrl_priors.priors.prior import Prior
 
 __all__ = ["ActionPrior", "policy_of"]
@@ -75,15 +79,38 @@ class ActionPrior(Prior):
         # The policy writes into a tensordict of its own, so that no key of the student is touched.
         private = tensordict.select(*self.in_keys)
         if isinstance(self.module, ProbabilisticTensorDictSequential):
-            private = self.module.get_dist_params(private)
+            try:
+                private = self.module.get_dist_params(private)
+            except RuntimeError as error:
+                self._explain(tensordict, error)
+                raise
         keys = _distribution_module(self.module).in_keys
-        return dict(zip(self.param_names, (private.get(key) for key in keys), strict=True))
+        params = dict(zip(self.param_names, (private.get(key) for key in keys), strict=True))
+        if not is_compiling() and (fault := parameter_fault(params)):
+            raise ValueError(f"The parameters of the {type(self).__name__} give no distribution: {fault}.")
+        return params
+
+    def _explain(self, tensordict: TensorDictBase, error: RuntimeError) -> None:
+        """Says it where a teacher can't read what it was given, as observations are of another precision."""
+        own = {p.dtype for p in self.module.parameters() if p.is_floating_point()}
+        given = {key: tensordict.get(key).dtype for key in self.in_keys}
+        other = {key: dtype for key, dtype in given.items() if dtype.is_floating_point and dtype not in own}
+        if own and other:
+            raise TypeError(
+                f"The teacher computes in {', '.join(map(str, own))}, and got {other}: convert the observations, e.g."
+                " with the transform DoubleToFloat, or the teacher, prior.to(torch.float64)."
+            ) from error
 
     def build_dist(self, params: dict[str, Tensor]) -> d.Distribution:
         """The policy's distribution with these parameters."""
         last = _distribution_module(self.module)
         values = TensorDict(dict(zip(last.in_keys, (params[name] for name in self.param_names), strict=True)))
-        return last.get_dist(values)
+        try:
+            dist = last.get_dist(values)
+        except ValueError as error:
+            raise ValueError(f"The parameters of the {type(self).__name__} give no distribution: {error}") from error
+        _check_kind(type(without_independent(dist)))  # the class may be known now only, e.g. a function's
+        return dist
 
 
 def policy_of(
@@ -110,11 +137,21 @@ def _distribution_module(module: TensorDictModuleBase) -> ProbabilisticTensorDic
         )
     last = [child for child in module.modules() if isinstance(child, ProbabilisticTensorDictModule)][-1]
     kind = last.distribution_class
-    if getattr(module, "return_composite", False) or kind is CompositeDistribution:
+    while isinstance(kind, partial):
+        kind = kind.func
+    if getattr(module, "return_composite", False):
+        kind = CompositeDistribution
+    if isinstance(kind, type):
+        _check_kind(kind)
+    return last
+
+
+def _check_kind(kind: type) -> None:
+    """Refuses a class of distributions that can't advise."""
+    if issubclass(kind, CompositeDistribution):
         raise NotImplementedError("Priors over several actions at once (CompositeDistribution) are not supported.")
-    if isinstance(kind, type) and issubclass(kind, (Delta, TensorDictDelta)):
+    if issubclass(kind, (Delta, TanhDelta, TensorDictDelta)):
         raise ValueError(
             f"A {kind.__name__} policy is deterministic: its log-probability can't advise. Give it a distribution,"
             " e.g. a Normal around its action."
         )
-    return last

@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch import distributions as d
+from torch.compiler import is_compiling
 from torchrl.modules import IndependentNormal
 
 from torchrl_priors.distributions import CATEGORICAL, without_independent
@@ -148,6 +149,10 @@ class _Params(nn.Module):
         if not isinstance(value, Tensor):
             raise TypeError(f"A teacher with output={self.output!r} must return a tensor, got {type(value).__name__}.")
         if self.output == "probs":
+            if not is_compiling() and not torch.allclose(value.sum(-1), torch.ones_like(value[..., 0]), atol=1e-3):
+                raise ValueError(
+                    "The teacher's probs are probabilities that sum to 1: are they logits (output='logits')?"
+                )
             return value.log()
         if self.output == "mean":
             assert self.std is not None

@@ -25,7 +25,7 @@ def policy_prior(
     """A policy of :func:`~torchrl_priors.networks.make_actor` and the statistics it was trained with as a teacher.
 
     It reads raw observations and normalises them by its own statistics as they are now, whatever the student does to
-    its own. :func:`~torchrl_priors.save_prior` writes it to a file.
+    its own. :func:`~torchrl_priors.artifacts.save_prior` writes it to a file.
 
     Args:
         actor (ProbabilisticActor): from :func:`~torchrl_priors.networks.make_actor`.

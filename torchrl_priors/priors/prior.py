@@ -14,7 +14,7 @@ from torch import Tensor
 from torch import distributions as d
 from torch.compiler import is_compiling
 
-from torchrl_priors.distributions import TORCHRL_ONE_HOT, action_shape
+from torchrl_priors.distributions import CATEGORICAL, TORCHRL_ONE_HOT, BoxUniform, action_shape, bounds_of, outside
 
 __all__ = ["NegatedPrior", "Prior", "PriorWrapper"]
 
@@ -108,7 +108,7 @@ class Prior(TensorDictModuleBase, ABC):
         """The distribution over actions at the states of ``tensordict``, which stays as it is.
 
         Args:
-            tensordict (TensorDictBase): holds :attr:`in_keys`, batch ``[*B]``.
+            tensordict (TensorDictBase): holds ``in_keys``, batch ``[*B]``.
         """
         return self.build_dist(self.get_params(tensordict))
 
@@ -116,7 +116,7 @@ class Prior(TensorDictModuleBase, ABC):
         r"""Log-probability of the action that was taken, :math:`\log\pi_0(a_t|s_t)`.
 
         Args:
-            tensordict (TensorDictBase): holds :attr:`in_keys` and the action, batch ``[*B]``.
+            tensordict (TensorDictBase): holds ``in_keys`` and the action, batch ``[*B]``.
 
         Keyword Args:
             dist (torch.distributions.Distribution, optional): from :meth:`get_dist`, to save its computation.
@@ -137,19 +137,39 @@ class Prior(TensorDictModuleBase, ABC):
         differs = f"The action space of the prior differs from the student's: {self.action_key!r}"
         expected = action_shape(dist)
         if action.shape != expected:
+            hint = ""
+            if isinstance(dist, CATEGORICAL) and abs(action.ndim - len(expected)) == 1:
+                hint = (
+                    " One of the two is one-hot, and the other an index: see one_hot=True of load_sb3_prior, or"
+                    " distribution_class=OneHotCategorical of a teacher of your own."
+                )
             raise ValueError(
                 f"{differs} is of shape {tuple(action.shape)}, and the prior's {type(dist).__name__} is over actions of"
-                f" shape {tuple(expected)} (batch {tuple(tensordict.batch_size)})."
+                f" shape {tuple(expected)} (batch {tuple(tensordict.batch_size)}).{hint}"
             )
-        if isinstance(dist, d.Categorical) and not isinstance(dist, TORCHRL_ONE_HOT) and not is_compiling():
+        if not is_compiling():
+            self._check_values(action, dist, differs)
+        log_prob = dist.log_prob(action)
+        return log_prob.flatten(tensordict.ndim).sum(-1) if log_prob.ndim > tensordict.ndim else log_prob
+
+    def _check_values(self, action: Tensor, dist: Any, differs: str) -> None:
+        if action.isnan().any():
+            raise ValueError(f"The student's action under {self.action_key!r} has NaN entries.")
+        if isinstance(dist, d.Categorical) and not isinstance(dist, TORCHRL_ONE_HOT):
             num_actions = dist.logits.shape[-1]
             if ((action < 0) | (action >= num_actions)).any():
                 raise ValueError(
                     f"{differs} has indices in [{int(action.min())}, {int(action.max())}], and the prior advises on"
                     f" {num_actions} actions."
                 )
-        log_prob = dist.log_prob(action)
-        return log_prob.flatten(tensordict.ndim).sum(-1) if log_prob.ndim > tensordict.ndim else log_prob
+            return
+        bounds = None if isinstance(dist, BoxUniform) else bounds_of(dist)
+        if bounds is not None and outside(action, action, bounds):
+            raise ValueError(
+                f"{differs} has values in [{float(action.min()):.4g}, {float(action.max()):.4g}], and the prior's"
+                f" {type(dist).__name__} has no finite opinion on some of them. Give both the same bounds, or make the"
+                " prior a Gaussian, as std=... does in load_sb3_prior."
+            )
 
     def adversary(self) -> Prior:
         r"""The negated advice: :math:`-\mu` for distributions with a ``loc``, negated ``logits`` for discrete ones.
@@ -164,7 +184,7 @@ class Prior(TensorDictModuleBase, ABC):
     def policy(self) -> TensorDictModuleBase:
         """The prior as a policy that acts, e.g. ``env.rollout(1000, prior.policy())``.
 
-        It writes the action, sampled or the mode, by :func:`~torchrl.envs.utils.set_exploration_type`; by default
+        It writes the action, sampled or the mode, by TorchRL's ``set_exploration_type``; by default
         the mode, as TorchRL's actors do.
 
         Examples:
@@ -177,7 +197,7 @@ class Prior(TensorDictModuleBase, ABC):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the parameters of the distribution under the namespace, in :attr:`out_keys`."""
+        """Writes the parameters of the distribution under the namespace, in ``out_keys``."""
         for key, value in zip(self.out_keys, self.get_params(tensordict).values(), strict=True):
             tensordict.set(key, value)
         return tensordict

@@ -10,7 +10,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from torchrl_priors.functional import prior_bonus
-from torchrl_priors.keys import check_option, read, under_next
+from torchrl_priors.keys import check_option, next_step, read, under_next
 from torchrl_priors.methods import get_method
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.transforms.batch_transform import BatchTransform
@@ -141,14 +141,20 @@ class PriorBonus(BatchTransform):
         if self.relative:
             hint = "the policy must return its log-probabilities"
             log_prob = log_prob - read(tensordict, self.student_log_prob_key, hint).reshape(log_prob.shape)
+        terminated = None
+        if self.shift == "next":
+            terminated = read(tensordict, self.terminated_key, "there is no bonus after an end")
+            if terminated.shape != log_prob.shape:
+                raise ValueError(
+                    f"Expected {self.terminated_key!r} of the shape of {self.log_prob_key!r}, {tuple(log_prob.shape)},"
+                    f" got {tuple(terminated.shape)}."
+                )
         weight = torch.ones_like(log_prob)
         module: PriorWeight | None = self.__dict__["prior_weight"]
         if module is not None:
-            at = tensordict.get("next") if self.shift == "next" else tensordict
+            keys = module.in_keys
+            at = tensordict.select(*keys) if terminated is None else next_step(tensordict, keys, terminated)
             # a weight of its own tensordict: the one of a loss is evaluated anew, with a gradient
-            weight = module(at.select(*module.in_keys)).get(module.out_keys[0])
+            weight = module(at).get(module.out_keys[0])
         bonus = prior_bonus(weight, log_prob)
-        if self.shift == "next":
-            terminated = read(tensordict, self.terminated_key, "there is no bonus after an end")
-            bonus = torch.where(terminated, torch.zeros_like(bonus), bonus)
-        return bonus
+        return bonus if terminated is None else torch.where(terminated, torch.zeros_like(bonus), bonus)

@@ -10,9 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 
+from torchrl_priors.advice import check_advice
 from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
-from torchrl_priors.keys import check_option, read, under_next
+from torchrl_priors.keys import check_option, next_step, read, under_next
 from torchrl_priors.priors import Prior
 from torchrl_priors.transforms.batch_transform import BatchTransform
 
@@ -133,17 +134,16 @@ class PriorLogProb(BatchTransform):
             for key, name in zip(self.prior.out_keys, self.prior.param_names, strict=True):
                 tensordict.set(key, params[name])
         value = self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)
-        if not torch.compiler.is_compiling() and not value.isfinite().all():
-            raise ValueError(
-                "The prior gives a log-probability that is not finite to an action that the student took: smooth it, or"
-                " keep the student's actions within its bounds."
-            )
+        check_advice(value, dist)
 
         at_boundary = torch.zeros_like(value)
         # only the time steps at which some trajectory was cut
         steps = wanted.movedim(time_dim, 0).flatten(1).any(-1).nonzero().squeeze(-1)
         if self.boundary != "zero" and len(steps):
-            following = tensordict.get("next")[(slice(None),) * time_dim + (steps,)]
+            keys = dict.fromkeys([*self.prior.in_keys, *self.__dict__["actor"].in_keys, *self.prior.draw_keys])
+            cut = (slice(None),) * time_dim + (steps,)
+            part = tensordict.select(*keys, *map(under_next, keys), strict=False)[cut]
+            following = next_step(part, keys, terminated[cut])
             at_boundary.index_copy_(time_dim, steps, self._evaluate_boundary(following).to(value.dtype))
 
         (key,) = self.out_keys
@@ -203,4 +203,5 @@ class PriorLogProb(BatchTransform):
             log_prob = -cross_entropy(policy, prior_dist, num_samples=self.num_samples)
         else:
             log_prob = prior_dist.log_prob(policy.sample())
+        check_advice(log_prob, prior_dist, policy)
         return joint(log_prob, following.ndim)

@@ -1,90 +1,61 @@
-"""Figures of several environments at once: curves, profiles and intervals of methods and their variants.
+"""Panels of methods and their variants, for each environment, teacher or prior: curves, profiles and intervals.
 
-A method may come with settings, as in ``"ae2r Cω=0.03"``: it keeps the method's colour, in a lighter shade and another
-dash for each variant.
+A method may come with settings, as in ``"ae2r Cω=0.03"``: see :mod:`torchrl_priors.plots.variants`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
 from torchrl_priors.metrics import MIN_RUNS, ConfidenceInterval, performance_profile
 from torchrl_priors.plots.style import (
-    BASELINE,
     COLUMN_WIDTH,
     TEXT_WIDTH,
-    line_style,
-    method_label,
     new_figure,
     outer_labels,
     paper_style,
     thousands,
 )
+from torchrl_priors.plots.variants import variant_label, variant_styles
 
-__all__ = ["interval_panels", "profile_panels", "return_curves", "variant_label", "variant_styles"]
+__all__ = ["curve_panels", "interval_panels", "profile_panels"]
 
-_DASHES: tuple[Any, ...] = ("-", (0, (4, 1.2)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
+Places: TypeAlias = Mapping[str, tuple[int, int]]
 
-
-def variant_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """The line of each method and variant; variants of a method follow each other from dark to light.
-
-    Examples:
-        >>> styles = variant_styles(["e2r", "ae2r Cω=1", "ae2r Cω=0.03"])
-        >>> [style["color"] for style in styles.values()]
-        ['#d55e00', '#0072b2', '#66aad1']
-    """
-    names = list(dict.fromkeys(names))
-    styles = {}
-    for name in names:
-        family = [other for other in names if _base(other) == _base(name)]
-        place = family.index(name)
-        light = 0.6 * place / max(1, len(family) - 1) if len(family) > 2 else 0.4 * place
-        red, green, blue = (part * (1 - light) + light for part in to_rgb(line_style(_base(name))["color"]))
-        style = {**line_style(_base(name)), "color": to_hex((red, green, blue))}
-        if _base(name) != BASELINE:
-            style["linestyle"] = _DASHES[place % len(_DASHES)]
-        styles[name] = style
-    return styles
-
-
-def variant_label(name: str, baseline: str | None = None) -> str:
-    r"""A method and its variant as they are printed; the baseline may have a name of its own.
-
-    Examples:
-        >>> variant_label("ae2r Cω=0.03"), variant_label("none", baseline="PPO")
-        ('AE2R $C_\\omega$=0.03', 'PPO')
-    """
-    base, settings = _base(name), name.partition(" ")[2].replace("Cω", r"$C_\omega$")
-    shown = baseline if base == BASELINE and baseline else method_label(base)
-    return f"{shown} {settings}" if settings else shown
-
-
-def _base(name: str) -> str:
-    return name.partition(" ")[0]
+_INK = "#222222"
+_MARKER: dict[str, Any] = {
+    "marker": "D",
+    "markersize": 3.6,
+    "color": _INK,
+    "markerfacecolor": "white",
+    "markeredgewidth": 0.8,
+    "linestyle": "none",
+    "zorder": 5,
+}
 
 
 @paper_style
-def return_curves(
+def curve_panels(
     panels: Mapping[str, Mapping[str, ConfidenceInterval]],
     steps: Mapping[str, Any],
     *,
     columns: int | None = None,
+    places: Places | None = None,
+    share_y: bool = False,
     xlabel: str = "Frames",
     ylabel: str = "Return",
     baseline: str | None = None,
-    ylim: tuple[float, float] | None = None,
     references: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Figure:
-    """Curves with bands, a panel per environment (and prior), each with its own scale.
+    """Curves with bands, a panel per environment (and prior).
 
     Args:
         panels: by title and method, a curve with its interval, arrays ``[points]``; a NaN interval is not drawn.
@@ -92,9 +63,10 @@ def return_curves(
 
     Keyword Args:
         columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
+        places (mapping, optional): row and column of each title, in the place of ``columns``.
+        share_y (bool): whether all panels have one scale, as those of one environment should. Defaults to ``False``.
         xlabel, ylabel (str): names of the axes.
         baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
-        ylim (tuple of float, optional): one scale for all panels.
         references: by title and name, a level to mark by a thin grey line with its name, e.g. the teacher's return.
 
     Returns:
@@ -105,11 +77,11 @@ def return_curves(
 
     Examples:
         >>> band = ConfidenceInterval(np.arange(3.0), np.arange(3.0) - 1, np.arange(3.0) + 1)
-        >>> len(return_curves({"Hopper": {"ae2r Cω=1": band}}, {"Hopper": [0, 50, 100]}).axes)
+        >>> len(curve_panels({"Hopper": {"ae2r Cω=1": band}}, {"Hopper": [0, 50, 100]}).axes)
         1
     """
     names = _names(panels)
-    figure, axes = _panels(panels, columns, row_height=1.75)
+    figure, axes = _panels(panels, columns, places, row_height=1.75, share_y=share_y)
     styles = variant_styles(names)
     for (title, curves), ax in zip(panels.items(), axes.values(), strict=True):
         for name, curve in curves.items():
@@ -131,12 +103,10 @@ def return_curves(
             )
         ax.set_title(title, linespacing=1.05)
         ax.margins(x=0)
-        if ylim:
-            ax.set_ylim(*ylim)
         ax.xaxis.set_major_formatter(FuncFormatter(thousands))
         ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
         ax.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
-    outer_labels(axes, xlabel, ylabel, share_y=False)
+    outer_labels(axes, xlabel, ylabel, share_y)
     _legend(figure, styles, baseline)
     return figure
 
@@ -178,7 +148,7 @@ def profile_panels(
         2
     """
     styles = variant_styles(_names(panels))
-    figure, axes = _panels(panels, columns, row_height=1.75)
+    figure, axes = _panels(panels, columns, None, row_height=1.75)
     if thresholds is None:
         every = np.concatenate([np.ravel(scores) for profiles in panels.values() for scores in profiles.values()])
         thresholds = np.linspace(-1, min(10.0, max(1.0, np.ceil(4 * np.quantile(every, 0.98)) / 4)), 401)
@@ -205,6 +175,10 @@ def interval_panels(
     *,
     center: float = 0.0,
     columns: int | None = None,
+    places: Places | None = None,
+    scale: float = 1.0,
+    reference: Mapping[str, Mapping[str, ConfidenceInterval]] | None = None,
+    reference_label: str = "Paper",
     xlabel: str = r"IQM of $r_{\pi_0}$",
     xlim: tuple[float, float] | None = None,
     baseline: str | None = None,
@@ -217,6 +191,10 @@ def interval_panels(
     Keyword Args:
         center (float): the dashed line: 0 for a ratio, ½ for a probability. Defaults to 0.
         columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
+        places (mapping, optional): row and column of each title, in the place of ``columns``.
+        scale (float): what values are multiplied with before they are drawn. Defaults to 1.
+        reference (mapping, optional): other values to compare with, by title and method; their ends are whiskers.
+        reference_label (str): their name in the legend. Defaults to ``"Paper"``.
         xlabel (str): name of the axis.
         xlim (tuple of float, optional): one scale for all panels; else each has its own, which holds the centre.
         baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
@@ -234,15 +212,20 @@ def interval_panels(
     """
     names = _names(panels)
     styles = variant_styles(names)
-    figure, axes = _panels(panels, columns, row_height=0.45 + 0.19 * len(names), legend=0.0)
+    legend = 0.35 if reference else 0.0
+    figure, axes = _panels(panels, columns, places, row_height=0.45 + 0.19 * len(names), legend=legend)
     for (title, intervals), ax in zip(panels.items(), axes.values(), strict=True):
         for row, name in enumerate(names):
             if name in intervals:
-                middle, low, high = (float(value) for value in intervals[name])
+                middle, low, high = (scale * float(value) for value in intervals[name])
                 color, point = styles[name]["color"], low == high  # which would have no colour without an edge
                 edge: dict[str, Any] = {"edgecolor": color, "linewidth": 3.5} if point else {"linewidth": 0}
                 ax.barh(row, high - low, left=low, height=0.62, color=color, alpha=0.75, **edge)
-                ax.vlines(middle, row - 0.31, row + 0.31, color="#222222", linewidth=1.3, zorder=3)
+                ax.vlines(middle, row - 0.31, row + 0.31, color=_INK, linewidth=1.3, zorder=3)
+            if name in (other := (reference or {}).get(title, {})):
+                middle, low, high = (scale * float(value) for value in other[name])
+                ax.hlines(row, low, high, color=_INK, linewidth=0.7, zorder=4)
+                ax.plot([middle], [row], **_MARKER)
         ax.axvline(center, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
         ax.set_title(title, linespacing=1.05)
         ax.set_yticks(range(len(names)), [variant_label(name, baseline) for name in names])
@@ -256,6 +239,11 @@ def interval_panels(
             ax.set_xlim(*xlim)
         ax.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
     outer_labels(axes, xlabel, "", share_y=True)
+    if reference:
+        bar, line = Patch(color="0.6", linewidth=0, label="Interval"), {**_MARKER, "marker": "|", "markersize": 8}
+        handles: list[Any] = [Line2D([], [], label="Estimate", **line), bar]
+        handles.append(Line2D([], [], label=reference_label, **_MARKER))
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), columnspacing=1.6)
     return figure
 
 
@@ -267,17 +255,28 @@ def _names(panels: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _panels(
-    panels: Mapping[str, Any], columns: int | None, *, row_height: float, legend: float = 0.35
+    panels: Mapping[str, Any],
+    columns: int | None,
+    places: Places | None,
+    *,
+    row_height: float,
+    legend: float = 0.35,
+    share_y: bool = False,
 ) -> tuple[Figure, dict[tuple[int, int], Axes]]:
     """An empty panel per title, by row and column."""
-    count = len(panels)
-    columns = min(count, columns or 3)
-    rows = -(-count // columns)
+    columns = min(len(panels), columns or 3)
+    cells = [divmod(index, columns) for index in range(len(panels))]
+    if places is not None:
+        cells = [places[title] for title in panels]
+        columns = 1 + max(column for _, column in cells)
+    rows = 1 + max(row for row, _ in cells)
     width = {1: COLUMN_WIDTH, 2: 1.5 * COLUMN_WIDTH}.get(columns, TEXT_WIDTH)
     figure = new_figure(width, legend + row_height * rows)
     grid = figure.add_gridspec(rows, columns)
-    cells = [divmod(index, columns) for index in range(count)]
-    return figure, {cell: figure.add_subplot(grid[cell]) for cell in cells}
+    axes: dict[tuple[int, int], Axes] = {}
+    for cell in cells:
+        axes[cell] = figure.add_subplot(grid[cell], sharey=next(iter(axes.values())) if share_y and axes else None)
+    return figure, axes
 
 
 def _draw_band(ax: Axes, x: Any, band: ConfidenceInterval, style: dict[str, Any], name: str) -> None:

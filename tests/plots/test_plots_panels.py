@@ -7,14 +7,8 @@ import pytest
 from matplotlib.colors import to_hex
 
 from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import method_color
-from torchrl_priors.plots.benchmark import (
-    interval_panels,
-    profile_panels,
-    return_curves,
-    variant_label,
-    variant_styles,
-)
+from torchrl_priors.plots import curve_panels, interval_panels, method_color, profile_panels
+from torchrl_priors.plots.variants import variant_label, variant_styles
 
 STEPS = np.arange(1.0, 4.0)
 BAND = ConfidenceInterval(STEPS, STEPS - 1, STEPS + 1)
@@ -32,30 +26,30 @@ def test_every_variant_has_a_line_of_its_own_and_the_first_its_methods_colour() 
 
 def test_a_legend_names_each_method_once_whatever_panels_it_is_in() -> None:
     panels = {"Hopper": dict.fromkeys(VARIANTS, BAND), "Ant": dict.fromkeys(VARIANTS[:2], BAND)}
-    figure = return_curves(panels, {"Hopper": STEPS, "Ant": STEPS}, baseline="PPO")
+    figure = curve_panels(panels, {"Hopper": STEPS, "Ant": STEPS}, baseline="PPO")
     texts = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     assert sorted(texts) == sorted(variant_label(name, "PPO") for name in VARIANTS)
     assert "PPO" in texts
 
 
 def test_curves_are_drawn_where_they_are() -> None:
-    (ax,) = return_curves({"Hopper": {"e2r": BAND}}, {"Hopper": 50 * STEPS}).axes
+    (ax,) = curve_panels({"Hopper": {"e2r": BAND}}, {"Hopper": 50 * STEPS}).axes
     (line,) = ax.lines
     np.testing.assert_array_equal(line.get_xydata(), np.stack([50 * STEPS, STEPS], 1))
 
 
 def test_a_reference_is_marked_by_name_at_its_level() -> None:
-    (ax,) = return_curves({"Hopper": {"e2r": BAND}}, {"Hopper": STEPS}, references={"Hopper": {"Teacher": 2.5}}).axes
+    (ax,) = curve_panels({"Hopper": {"e2r": BAND}}, {"Hopper": STEPS}, references={"Hopper": {"Teacher": 2.5}}).axes
     assert [text.get_text() for text in ax.texts] == ["Teacher"]
     assert any(set(line.get_ydata()) == {2.5} for line in ax.lines)
 
 
 def test_a_curve_that_does_not_fit_its_steps_is_named() -> None:
     with pytest.raises(ValueError, match="'e2r' of 'Hopper'"):
-        return_curves({"Hopper": {"e2r": BAND}}, {"Hopper": STEPS[:2]})
+        curve_panels({"Hopper": {"e2r": BAND}}, {"Hopper": STEPS[:2]})
 
 
-@pytest.mark.parametrize("draw", [lambda panels: return_curves(panels, {}), profile_panels, interval_panels])
+@pytest.mark.parametrize("draw", [lambda panels: curve_panels(panels, {}), profile_panels, interval_panels])
 def test_nothing_to_draw_is_an_error(draw) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match="nothing to draw"):
         draw({"Hopper": {}})
