@@ -96,7 +96,7 @@ def test_a_home_directory_may_be_written_short(whole, tmp_path, monkeypatch):
     command = [*TINY, "out=~/run", "method=kickstart", "prior.path=~/teacher.safetensors", "total_frames=64"]
     monkeypatch.setattr(sys, "argv", ["mujoco", *command])
     monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")
-    start(mujoco.main)
+    start(mujoco.main, "mujoco")
     assert (tmp_path / "run/eval.csv").exists()
 
 
