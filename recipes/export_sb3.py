@@ -65,4 +65,4 @@ def main(cfg: ExportConfig) -> None:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(main, "export_sb3")

@@ -277,4 +277,4 @@ def main(cfg: StudyConfig) -> None:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(main, "mujoco_study")

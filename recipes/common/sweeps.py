@@ -26,6 +26,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from recipes.common.help import help_text
+
 __all__ = ["SweepSummary", "cores", "fail", "in_sweep", "start"]
 
 
@@ -44,8 +46,14 @@ def cores(installed: bool) -> dict[str, Any]:
 ConfigStore.instance().store(group="hydra/launcher", name="cores", node=cores(_installed("hydra_joblib_launcher")))
 
 
-def start(main: Callable[[], Any]) -> None:
-    """Run a recipe's command. ``key=~/x`` is in one's home directory, which the shell and Hydra leave to others."""
+def start(main: Callable[[], Any], name: str) -> None:
+    """Run the command of the recipe ``conf/<name>.yaml``, or say its help.
+
+    ``key=~/x`` is in one's home directory, which the shell and Hydra leave to others.
+    """
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(help_text(name))
+        return
     home = re.compile(r"(?<==)~(?=/|$)")
     sys.argv[1:] = [home.sub(str(Path.home()), word) for word in sys.argv[1:]]
     main()

@@ -28,4 +28,4 @@ def main(cfg: GridworldConfig) -> str | None:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(main, "gridworld")

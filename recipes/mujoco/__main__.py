@@ -23,4 +23,4 @@ def main(cfg: MujocoConfig) -> str | None:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(main, "mujoco")

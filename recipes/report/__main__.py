@@ -27,4 +27,4 @@ def main(cfg: ReportConfig) -> None:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(main, "report")

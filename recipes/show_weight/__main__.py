@@ -25,4 +25,4 @@ def main(cfg: ShowConfig) -> None:
 
 
 if __name__ == "__main__":
-    start(main)
+    start(main, "show_weight")

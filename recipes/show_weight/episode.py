@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from recipes.common.checkpoints import Checkpoints
-from recipes.common.run_folder import sha256
+from recipes.common.run_folder import read_json, sha256
 from recipes.mujoco.agent import Agent
 from recipes.mujoco.run import identity
 from recipes.mujoco.task import Task, open_task
+from recipes.show_weight.source import read_config, reading
 from torchrl_priors import PriorLogProb, StructuralDegradation, plots
 from torchrl_priors.collectors import VectorCollector
 from torchrl_priors.collectors.vector_env import spread_seed
@@ -33,15 +32,21 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, Task]:
     A checkpoint holds every network and the normaliser as plain tensors: nothing else needs to be exported.
 
     Raises:
-        ValueError: the run has no learned weight or no checkpoint, the teacher is not that of the run, or the
-            environment or the checkpoint could run code.
+        ValueError: the run has no learned weight or no checkpoint, one of its files is damaged, the teacher is not that
+            of the run, or the environment or the checkpoint could run code.
     """
-    cfg: Any = OmegaConf.load(folder / "config.yaml")
+    cfg = read_config(folder)
+    with reading(folder):
+        return _load_agent(folder, cfg, teacher)
+
+
+def _load_agent(folder: Path, cfg: Any, teacher: str | None) -> tuple[Agent, Task]:
     if cfg.method == "trial" or not get_method(cfg.method).adaptive:
         raise ValueError(f"{folder} is a run of method={cfg.method}, which has no learned weight.")
     if teacher is not None:
         cfg.prior.path = teacher
-    expected = json.loads((folder / "config.json").read_text())["prior"]["sha256"]
+    matters = read_json(folder / "config.json")
+    expected = matters["prior"]["sha256"]
     path = Path(cfg.prior.path)
     if not path.is_file():
         raise ValueError(f"The run's teacher {path} is not there: say where it is by episode.teacher=<file>.")
@@ -52,8 +57,7 @@ def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, Task]:
         raise ValueError(f"{folder} is a run of {env_id!r}: an environment that names a module to import is not shown.")
     task = open_task(cfg)
     agent = Agent(cfg, task)
-    known = identity(json.loads((folder / "config.json").read_text()))
-    checkpoints = Checkpoints(folder / "checkpoints", cfg.checkpoint.keep, known)
+    checkpoints = Checkpoints(folder / "checkpoints", cfg.checkpoint.keep, identity(matters))
     if not checkpoints.load({"agent": agent}, dict):
         raise ValueError(f"{folder} has no checkpoint.")
     agent.normalizer.freeze()

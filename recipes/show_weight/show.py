@@ -14,6 +14,7 @@ from recipes.common.checks import check_keys
 from recipes.gridworld.run_parts import parse_prior
 from recipes.gridworld.study import TaughtWorld, make_learner
 from recipes.report.runs import is_gridworld
+from recipes.show_weight.source import read_config, reading
 from torchrl_priors import plots
 from torchrl_priors.methods import get_method
 
@@ -75,7 +76,12 @@ def show(cfg: ShowConfig) -> list[Path]:
 
 def _show_gridworld(cfg: ShowConfig, folder: Path, out: Path) -> list[Path]:
     idle = {"schedule": {"methods": "annealed"}}  # a study may be older than schedules
-    study: Any = OmegaConf.merge(idle, OmegaConf.load(folder / "config.yaml"))
+    study: Any = OmegaConf.merge(idle, read_config(folder))
+    with reading(folder / "config.yaml"):
+        return _maps(cfg, study, folder, out)
+
+
+def _maps(cfg: ShowConfig, study: Any, folder: Path, out: Path) -> list[Path]:
     method, prior, last = cfg.gridworld.method, cfg.gridworld.prior, study.evaluation.points
     parse_prior(prior)
     if not get_method(method).adaptive:

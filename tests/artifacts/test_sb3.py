@@ -8,8 +8,9 @@ import io
 import json
 import pickle
 import sys
+import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,30 @@ from gymnasium import spaces
 from hydra import compose, initialize_config_dir
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sb3_cases import BOX, MODELS, PPO, STD, DummyVecEnv, Model, Noise, Saved, VecFrameStack, VecNormalize, save_model
+from sb3_cases import (
+    A2C,
+    BOX,
+    MODELS,
+    PPO,
+    STD,
+    DummyVecEnv,
+    Model,
+    Noise,
+    Saved,
+    VecFrameStack,
+    VecNormalize,
+    save_model,
+)
 from sb3_corpus import Stands
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import OneHot
+from torchrl.envs import ActionScaling, GymWrapper, TransformedEnv
 
 from recipes.export_sb3 import export
 from torchrl_priors.artifacts import ArtifactError, load_prior, load_sb3_prior, save_prior
 from torchrl_priors.artifacts.sb3_files import read_vecnormalize
-from torchrl_priors.priors import BoltzmannPrior, ModulePrior
+from torchrl_priors.priors import BoltzmannPrior, ModulePrior, RescaledPrior
 
 CONF = Path(__file__).parents[2] / "conf"
 NUMBER = 1000
@@ -222,6 +237,46 @@ class TestConversion:
         assert load_prior(tmp_path / "teacher.safetensors").get_dist(batch_of(observations(MODELS["sac"], 1))).stddev[
             0, 0
         ] == pytest.approx(0.1)
+
+
+class TestWhatIsForgotten:
+    @pytest.mark.parametrize("name", MODELS)
+    def test_statistics_that_an_on_policy_model_had(self, saved: Callable[[str], Saved], name: str) -> None:
+        case = MODELS[name]
+        warned = case.normalize and case.algorithm in (PPO, A2C)
+        with pytest.warns(UserWarning, match="was trained with VecNormalize") if warned else no_warning():
+            load_sb3_prior(saved(name).path, **case.told)
+        with no_warning():
+            convert(saved(name), name)
+
+    def test_statistics_of_rewards_alone(self, tmp_path: Path) -> None:
+        env = VecNormalize(DummyVecEnv([Noise]), norm_obs=False)
+        PPO("MlpPolicy", env, device="cpu", n_steps=8, batch_size=8).learn(8).save(tmp_path / "model.zip")
+        env.save(str(tmp_path / "vec.pkl"))
+        with pytest.warns(UserWarning, match="also if it only normalised rewards"):
+            load_sb3_prior(tmp_path / "model.zip")
+        with no_warning():
+            load_sb3_prior(tmp_path / "model.zip", vecnormalize=tmp_path / "vec.pkl")
+
+    @pytest.mark.parametrize("name", ["a2c", "sac", "td3", "ppo_sde"])
+    def test_the_unit_of_the_actions(self, saved: Callable[[str], Saved], name: str) -> None:
+        env = TransformedEnv(GymWrapper(Noise()), ActionScaling())
+        convert(saved(name), name, action_spec=env.base_env.action_spec)
+        with pytest.raises(ArtifactError, match=r"acts within .*2\.0, 0\.75.* within .*RescaledPrior"):
+            convert(saved(name), name, action_spec=env.action_spec)
+        prior = RescaledPrior(convert(saved(name), name), *map(torch.as_tensor, (BOX.low, BOX.high)))
+        batch = batch_of(observations(MODELS[name], 20))
+        mean = prior.get_dist(batch).deterministic_sample if name == "sac" else prior.get_dist(batch).mean
+        assert mean.abs().max() <= 1 + 1e-6
+        with pytest.raises(ArtifactError, match=r"actions of shape \(2,\)"):
+            convert(saved(name), name, action_spec=OneHot(2))
+
+
+@contextlib.contextmanager
+def no_warning() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
 
 
 class TestRelatives:

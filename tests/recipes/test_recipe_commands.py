@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from recipes.common.sweeps import start
+from torchrl_priors.methods import METHODS
 
 pytest.importorskip("mujoco")
 
@@ -23,7 +27,7 @@ REQUIRED = {
 PACKAGES = {"report", "show_weight", "gridworld", "mujoco"}
 MAINS = {
     name: importlib.import_module(f"recipes.{name}.__main__" if name in PACKAGES else f"recipes.{name}").main
-    for name in REQUIRED
+    for name in (*REQUIRED, "mujoco_study")
 }
 Recipe = Callable[..., str]
 
@@ -39,7 +43,7 @@ def recipe(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
         monkeypatch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
         monkeypatch.setattr(sys, "argv", [name, *arguments])
         try:
-            MAINS[name]()
+            start(MAINS[name], name)
         except SystemExit as end:
             if end.code:
                 return str(end.code)
@@ -48,15 +52,30 @@ def recipe(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
     return run
 
 
-@pytest.mark.parametrize("name", REQUIRED)
-def test_help_says_what_a_recipe_does_how_and_where_its_keys_are_described(name: str, recipe: Recipe) -> None:
+@pytest.mark.parametrize("name", MAINS)
+def test_help_says_what_a_recipe_does_and_what_each_key_means(name: str, recipe: Recipe) -> None:
     said = recipe(name, "--help")
-    first = (ROOT / "conf" / f"{name}.yaml").read_text().splitlines()[0]
-    assert said.startswith(first[2:].split(".")[0])  # the YAML's own first line
+    text = (ROOT / "conf" / f"{name}.yaml").read_text()
+    assert said.startswith(text[2:].split(".")[0])  # the YAML's own first line
     assert f"python -m recipes.{name}" in said
-    assert f"conf/{name}.yaml" in said
-    assert all(f"\n{key}: ???\n" in said for key in REQUIRED[name])
+    assert all(f"\n{key}: ???  # " in said for key in REQUIRED.get(name, []))
     assert "schema" not in said
+    assert "hydra" not in said
+    for comment in re.findall("#.*", text.partition("\n\n")[2]):
+        assert re.sub(r"# (\w+: )?", "", comment, count=1) in said
+    assert recipe(name, "method=er", "-h") == said
+
+
+@pytest.mark.parametrize(
+    ("name", "group"), [("gridworld", "study"), ("mujoco", "env"), ("mujoco_study", "study_mujoco")]
+)
+def test_help_lists_what_there_is_to_choose_from(name: str, group: str, recipe: Recipe) -> None:
+    said = recipe(name, "--help")
+    for file in (ROOT / "conf" / group).glob("*.yaml"):
+        assert f"{group}={file.stem}" in said
+    if name != "mujoco_study":
+        assert f"Methods: {', '.join(METHODS)}" in said
+        assert ("worlds: 1000" if name == "gridworld" else "num_envs: 2") in said
 
 
 @pytest.mark.parametrize("name", [name for name, keys in REQUIRED.items() if keys])

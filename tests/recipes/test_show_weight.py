@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -111,3 +112,74 @@ def test_another_teacher_is_refused(mujoco_run, tmp_path):
         load_agent(mujoco_run, str(mujoco_run / "policy.safetensors"))
     with pytest.raises(ValueError, match=r"absent\.safetensors is not there"):
         load_agent(mujoco_run, str(tmp_path / "absent.safetensors"))
+
+
+def refused(folder: Path) -> str:
+    """Why a run is not shown, in one line."""
+    with pytest.raises((ValueError, OSError)) as error:
+        show(config("show_weight", f"run={folder}", "gridworld.points=[1]", "episode.steps=3"))
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "worlds: 2\nseed: ${oc.env:SECRET}\n",
+        "worlds: 2\nstudent: {lr: ['${oc.env:SECRET}']}\n",
+        "method: ae2r\nprior: {path: '${oc.env:SECRET}'}\n",
+    ],
+)
+def test_nothing_is_looked_up_for_a_configuration(text, tmp_path, monkeypatch):
+    monkeypatch.setenv("SECRET", "geheim")
+    (tmp_path / "config.yaml").write_text(text)
+    message = refused(tmp_path)
+    assert "refers to something else" in message
+    assert "geheim" not in message
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"- 1\n",
+        b"\xff\xfe",
+        b"worlds: 2",
+        b"worlds: [",
+        b"worlds: x\nevaluation: {points: 3}",
+        b"worlds: ${",
+        b"method: ae2r",
+        b"method: [ae2r]",
+        b"method: none",
+        b"{[1]: 2}",
+        b"!!python/object/apply:os.system [x]",
+    ],
+)
+def test_a_damaged_configuration_is_named(content, tmp_path):
+    (tmp_path / "config.yaml").write_bytes(content)
+    refused(tmp_path)
+
+
+def test_a_damaged_run_is_named(mujoco_run, tmp_path):
+    folder = tmp_path / "run"
+    (checkpoint,) = (path.name for path in (mujoco_run / "checkpoints").iterdir() if path.is_dir())
+
+    def damage(file: str, content: bytes | None) -> str:
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(mujoco_run, folder)
+        if content is None:
+            (folder / file).unlink()
+        else:
+            (folder / file).write_bytes(content)
+        return refused(folder)
+
+    whole = (mujoco_run / "config.yaml").read_bytes()
+    for content in (None, b"", b"[]", b"{}", b'{"prior": null}', b'{"prior": {}}'):
+        damage("config.json", content)
+    for content in (b"", whole[: len(whole) // 2], whole.replace(b"- 8", b"- 9"), whole.replace(b"v5", b"v99")):
+        damage("config.yaml", content)
+    for file in sorted((mujoco_run / "checkpoints" / checkpoint).rglob("*.memmap"))[::5]:
+        relative = file.relative_to(mujoco_run)
+        assert f"{file.name} is damaged" in damage(str(relative), b"")
+        assert f"{file.name} is missing" in damage(str(relative), None)

@@ -108,8 +108,9 @@ def load_prior(
         observation_spec (TensorSpec, sequence of int or int, optional): the student's raw observations, or the shape of
             one. Defaults to ``None``: not checked.
         action_spec (TensorSpec, sequence of int or int, optional): the student's actions, the shape of one, or the
-            number of discrete ones. Needs ``observation_spec``. Defaults to ``None``: not checked here, but whenever an
-            action is scored.
+            number of discrete ones. The bounds of a spec must be those of the prior, if it has some:
+            :class:`~torchrl_priors.priors.RescaledPrior` takes it to others. Needs ``observation_spec``. Defaults to
+            ``None``: not checked here, but whenever an action is scored.
         in_key (NestedKey, optional): what to read in place of the one key that the prior read, e.g. *raw* observations
             ``[*B, obs_dim]``. Defaults to ``None``: the same.
         namespace (NestedKey): the parameters are written under ``(namespace, name)``. Defaults to ``"prior"``.

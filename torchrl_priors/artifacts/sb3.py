@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.modules import OneHotCategorical, TanhNormal
 
 from torchrl_priors.artifacts.errors import ArtifactError, short
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
 from torchrl_priors.artifacts.sb3_network import Family, action_bounds, build_layers, find_family
+from torchrl_priors.artifacts.spaces import check_spaces
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors import BoltzmannPrior, ModulePrior
 
 __all__ = ["load_sb3_prior"]
 
+_Output: TypeAlias = Literal["logits", "mean", "mean_std"]
 _POLICIES = re.compile(
     r"stable_baselines3\.(common|ppo|a2c|sac|td3|dqn)\.policies|sb3_contrib\.(tqc|trpo|qrdqn)\.policies"
 )
@@ -36,6 +40,7 @@ def load_sb3_prior(
     clip_mean: bool = True,
     activation: str | None = None,
     one_hot: bool = False,
+    action_spec: TensorSpec | None = None,
     in_key: NestedKey = "observation",
     namespace: NestedKey = "prior",
     device: torch.device | str | None = None,
@@ -66,7 +71,8 @@ def load_sb3_prior(
 
     Keyword Args:
         vecnormalize (str or path, optional): the file of ``VecNormalize.save``, whose statistics the policy was trained
-            with. Defaults to ``None``: it reads raw observations.
+            with. Defaults to ``None``: it reads raw observations. Files of PPO, A2C and TRPO show whether there were
+            any: if so, a warning says that they are missing.
         std (float or Tensor, optional): standard deviation of a Gaussian around the deterministic action, in the unit
             of the action, a number or one per dimension; required for TD3, DDPG and ``use_sde=True``. Defaults to
             ``None``: the policy's own distribution.
@@ -78,6 +84,9 @@ def load_sb3_prior(
             a check, for what the file says counts, and if it says nothing Stable-Baselines3's default (tanh for PPO,
             A2C and TRPO, ReLU for the others). Defaults to ``None``: not checked.
         one_hot (bool): whether discrete actions are one-hot ``[*B, A]``, not indices ``[*B]``. Defaults to ``False``.
+        action_spec (TensorSpec, optional): the student's actions, which must be of the same kind, size and bounds.
+            :class:`~torchrl_priors.priors.RescaledPrior` takes a teacher to other bounds, such as those behind
+            :class:`~torchrl.envs.ActionScaling`. Defaults to ``None``: not checked.
         in_key (NestedKey): raw observations ``[*B, *obs]``, images with channels first. Defaults to ``"observation"``.
         namespace (NestedKey): as in :class:`~torchrl_priors.ActionPrior`.
         device (torch.device, optional): defaults to the CPU.
@@ -86,7 +95,8 @@ def load_sb3_prior(
         FileNotFoundError: there is no such file.
         ArtifactError: a file is damaged or none of Stable-Baselines3; or the policy is of a kind that can't be read:
             observations of several entries or discrete ones, actions that are neither ``Discrete`` nor a ``Box`` of one
-            dimension, recurrent or custom networks, statistics of single frames. The message says how
+            dimension, recurrent or custom networks, statistics of single frames; or it is none for ``action_spec``. The
+            message says how
             :class:`~torchrl_priors.CallablePrior` takes it.
         ValueError: TD3 without ``std``, DQN without ``temperature``; ``std`` with discrete actions or of another size
             than the actions, ``one_hot`` with continuous ones, ``temperature`` without action values, or an activation
@@ -105,6 +115,12 @@ def load_sb3_prior(
     family = find_family(checkpoint)
     discrete = checkpoint.action_space.kind == "Discrete"
     _check_arguments(path, checkpoint, family, std=std, temperature=temperature, one_hot=one_hot)
+    if vecnormalize is None and family == "on_policy" and checkpoint.original_obs:
+        warnings.warn(
+            f"{path} was trained with VecNormalize, and vecnormalize is missing: its advice on raw observations is"
+            " wrong. Pass the file of VecNormalize.save, also if it only normalised rewards.",
+            stacklevel=2,
+        )
     statistics = None if vecnormalize is None else read_vecnormalize(Path(vecnormalize))
     if statistics is not None and tuple(statistics.mean.shape) != checkpoint.observation_space.shape:
         raise ArtifactError(
@@ -120,12 +136,17 @@ def load_sb3_prior(
         if family == "squashed" and std is None:
             low, high = action_bounds(checkpoint)
             kwargs |= {"distribution_class": TanhNormal, "distribution_kwargs": {"low": low, "high": high}}
+        prior: ModulePrior | BoltzmannPrior
+        if temperature is not None:
+            prior = BoltzmannPrior(network, temperature, **kwargs)
+        else:
+            output: _Output = "logits" if discrete else "mean_std" if std is None else "mean"
+            prior = ModulePrior(network, output, std=std, **kwargs)
+        if action_spec is not None:
+            check_spaces(prior, checkpoint.observation_space.shape, action_spec)
     except ArtifactError as error:
         raise _refused(path, error) from error
-    if temperature is not None:
-        return BoltzmannPrior(network, temperature, **kwargs).to(device)
-    output: Literal["logits", "mean", "mean_std"] = "logits" if discrete else "mean_std" if std is None else "mean"
-    return ModulePrior(network, output, std=std, **kwargs).to(device)
+    return prior.to(device)
 
 
 def _refused(path: str | os.PathLike[str], error: ArtifactError) -> ArtifactError:

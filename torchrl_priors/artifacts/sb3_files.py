@@ -60,6 +60,8 @@ class Checkpoint:
     policy_module: str
     options: dict[str, Any]
     use_sde: bool
+    original_obs: bool
+    """Whether it has observations as they were before ``VecNormalize``; off-policy models have some in any case."""
     version: str
     weights: dict[str, Tensor]
 
@@ -108,6 +110,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         policy_module=str(policy.get("__module__")) if isinstance(policy, dict) else "",
         options=options,
         use_sde=any(part.get("use_sde") not in (None, False) for part in (values, options)),
+        original_obs=values.get("_last_original_obs") is not None,
         version=version.decode("utf-8", "replace").strip()[:100],
         weights=_weights(weights),
     )

@@ -9,11 +9,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torch import distributions as d
-from torchrl.data import Categorical, Composite, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
+from torchrl.modules import TanhNormal
 
-from torchrl_priors.artifacts.errors import ArtifactError
-from torchrl_priors.distributions import TORCHRL_ONE_HOT, action_shape
+from torchrl_priors.artifacts.errors import ArtifactError, short
+from torchrl_priors.distributions import TORCHRL_ONE_HOT, BoxUniform, action_shape
 from torchrl_priors.priors import Prior
+from torchrl_priors.priors.layers import ClipToBox, ScaleToBox
 
 __all__ = ["check_spaces"]
 
@@ -29,7 +31,7 @@ def check_spaces(prior: Prior, observation_spec: Spec, action_spec: Spec | None 
         action_spec (TensorSpec, sequence of int or int, optional): the actions, the shape of one, or their number.
 
     Raises:
-        ArtifactError: it can't read the observations, or advises on other actions.
+        ArtifactError: it can't read the observations, or advises on other actions or within other bounds.
         TypeError: a spec is one of several entries.
     """
     for spec in (observation_spec, action_spec):
@@ -45,6 +47,36 @@ def check_spaces(prior: Prior, observation_spec: Spec, action_spec: Spec | None 
         raise ArtifactError(f"it can't read observations of shape {shape}, {observation.dtype}: {error}") from error
     if action_spec is not None:
         _check_actions(dist, action_spec)
+        if isinstance(action_spec, Bounded):
+            _check_bounds(_known_bounds(prior, dist), action_spec)
+
+
+def _known_bounds(prior: Prior, dist: Any) -> tuple[Tensor, Tensor] | None:
+    """The bounds of a prior's actions: of its distribution, or of the last of its layers that have some."""
+    if isinstance(dist, TanhNormal):
+        return torch.as_tensor(dist.low), torch.as_tensor(dist.high)
+    if isinstance(dist, BoxUniform):
+        return dist.base_dist.low, dist.base_dist.high
+    boxes = [layer for layer in prior.modules() if isinstance(layer, (ClipToBox, ScaleToBox))]
+    return (boxes[-1].low, boxes[-1].high) if boxes else None
+
+
+def _check_bounds(bounds: tuple[Tensor, Tensor] | None, spec: Bounded) -> None:
+    """Holds the bounds of the teacher against the student's, where there are some."""
+    if bounds is None:
+        return
+    of_student = spec.space.low, spec.space.high
+    for mine, student in zip(bounds, of_student, strict=True):
+        mine, student = torch.broadcast_tensors(mine.to(student), student)
+        known = (mine.abs() < torch.finfo(torch.float32).max) & student.isfinite()
+        if not torch.allclose(mine[known], student[known], rtol=1e-4, atol=1e-6):
+            low, high = (bound.flatten().tolist() for bound in bounds)
+            to_low, to_high = (bound.flatten().tolist() for bound in of_student)
+            raise ArtifactError(
+                f"it acts within {short(low)} and {short(high)}, and the student within {short(to_low)} and"
+                f" {short(to_high)}, as behind ActionScaling: load it without action_spec, and pass"
+                " torchrl_priors.priors.RescaledPrior(prior, low, high, to_low=..., to_high=...)"
+            )
 
 
 def _check_actions(dist: Any, spec: Spec) -> None:

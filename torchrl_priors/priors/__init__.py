@@ -9,6 +9,7 @@ from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.policy import policy_prior
 from torchrl_priors.priors.prior import Prior
+from torchrl_priors.priors.rescale import RescaledPrior
 from torchrl_priors.priors.uniform import UniformPrior
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "MixturePrior",
     "ModulePrior",
     "Prior",
+    "RescaledPrior",
     "UniformPrior",
     "policy_prior",
     "warn_of_another_teacher",
