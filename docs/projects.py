@@ -16,6 +16,7 @@ ALIASES = {
     "torch.distributions.Distribution": "torch.distributions.distribution.Distribution",
     "torch.distributions.MixtureSameFamily": "torch.distributions.mixture_same_family.MixtureSameFamily",
     "torch.nn.Parameter": "torch.nn.parameter.Parameter",
+    "torchrl.envs.ActionScaling": "torchrl.envs.transforms.ActionScaling",
     "torchrl.envs.Compose": "torchrl.envs.transforms.Compose",
     "torchrl.envs.RewardSum": "torchrl.envs.transforms.RewardSum",
     "torchrl.modules.ProbabilisticActor": "torchrl.modules.tensordict_module.ProbabilisticActor",

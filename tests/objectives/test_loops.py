@@ -227,5 +227,8 @@ def test_pixels_that_were_scaled_already_are_not_scaled_again() -> None:
     read = TeacherInput((1, 4, 4), pixels=True)
     pixels = torch.randint(0, 256, (3, 1, 4, 4), dtype=torch.uint8)
     torch.testing.assert_close(read(pixels), read(pixels.float()))
-    with pytest.raises(ValueError, match="ToTensorImage"):
-        read(pixels / 255)
+    read(torch.zeros(1, 4, 4))  # a black frame
+    standard = (pixels.float() - 128) / 60
+    for wrong in (pixels / 255, pixels / 255 + 0.03, standard, standard.abs() * 200):
+        with pytest.raises(ValueError, match="ToTensorImage"):
+            read(wrong)

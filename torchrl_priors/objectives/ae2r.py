@@ -15,14 +15,16 @@ from tensordict.nn import (
 )
 from tensordict.utils import NestedKey
 from torch import distributions as d
+from torch.compiler import is_compiling
 
 from torchrl_priors.keys import check_option, out_key, under_next
 from torchrl_priors.methods import MethodSpec, get_method
-from torchrl_priors.priors import Prior
+from torchrl_priors.priors import Prior, warn_of_another_teacher
 
 from .networks_loss import NetworksLoss
 from .selected import SelectedOutput
 from .terms import AuxiliaryTerm, Found, RawCriticTerm, Term, WeightTerm
+from .wiring import Wiring, check_teacher
 
 __all__ = ["AE2RLoss"]
 
@@ -106,7 +108,7 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
     one, ``"prior_bonus"``. What does not apply is absent, never NaN: :attr:`out_keys` lists what an instance writes.
 
     Raises:
-        ValueError: an unknown option, or one that lacks the network it needs.
+        ValueError: an unknown option, or one that lacks the network it needs; the student as its own prior.
         TypeError: a prior without ``get_dist``.
         KeyError: at call, the batch lacks an entry.
 
@@ -202,6 +204,7 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
                 raise ValueError(f"{name} must be in [0, 1], got {share}.")
         if not hasattr(prior, "get_dist"):
             raise TypeError(f"The prior must be a Prior or a policy, got {type(prior).__name__}.")
+        check_teacher(actor_network, prior)
         if prior_in_batch and not isinstance(prior, Prior):
             raise ValueError(
                 f"prior_in_batch=True needs a Prior, got {type(prior).__name__}: ActionPrior(policy) makes it one."
@@ -216,6 +219,8 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
 
         self.set_network("actor_network", actor_network)
         self.prior = prior
+        self.wiring = Wiring(self)
+        self.register_load_state_dict_pre_hook(warn_of_another_teacher)
         self.prior_in_batch = prior_in_batch
         if not spec.adaptive:
             prior_weight = critic_network = None
@@ -276,6 +281,8 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
 
     def losses_of(self, tensordict: TensorDictBase, dist: d.Distribution | None = None) -> TensorDictBase:
         """See :meth:`forward`; ``dist`` is the student's distribution, if it is at hand."""
+        if not is_compiling():
+            self.wiring.look(self, tensordict)
         found: Found = {}
         for term in self.terms:
             term(tensordict, found, dist)

@@ -4,6 +4,7 @@ from torchrl_priors.priors.action_prior import ActionPrior
 from torchrl_priors.priors.affordance import AffordancePrior
 from torchrl_priors.priors.boltzmann import BoltzmannPrior
 from torchrl_priors.priors.callable import CallablePrior
+from torchrl_priors.priors.loading import warn_of_another_teacher
 from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.policy import policy_prior
@@ -22,4 +23,5 @@ __all__ = [
     "RescaledPrior",
     "UniformPrior",
     "policy_prior",
+    "warn_of_another_teacher",
 ]

@@ -73,9 +73,8 @@ class TeacherInput(nn.Module):
                 f"The teacher reads raw observations of shape [*B, {', '.join(map(str, self.shape))}], got"
                 f" {tuple(observation.shape)}."
             )
-        floats = self.pixels and observation.is_floating_point() and observation.numel() > 0
-        if floats and not is_compiling() and 0 < observation.max() <= 1:
-            raise ValueError("The teacher reads raw pixels from 0 to 255, got floats up to 1, as of ToTensorImage.")
+        if self.pixels and observation.is_floating_point() and observation.numel() > 0 and not is_compiling():
+            _check_pixels(observation)
         if self.mean is not None and self.var is not None:
             observation = (observation.to(self.mean) - self.mean) / (self.var + self.eps).sqrt()
             observation = observation.clamp(-self.clip, self.clip)
@@ -85,6 +84,17 @@ class TeacherInput(nn.Module):
         if not self.flatten:
             return observation
         return observation.reshape(*observation.shape[:batch_ndim], math.prod(self.shape))
+
+
+def _check_pixels(observation: Tensor) -> None:
+    """Refuses floats that are no raw pixels. Some have fractions, as of interpolation, which may overshoot 1 too."""
+    low, high = float(observation.min()), float(observation.max())
+    scaled = 0 < high <= 1 or (high < 2 and bool((observation != observation.round()).any()))
+    if scaled or low < 0 or high > 255:
+        raise ValueError(
+            f"The teacher reads raw pixels from 0 to 255, got floats from {low:.3g} to {high:.3g}, as of ToTensorImage"
+            " or ObservationNorm: keep the raw pixels under a key of their own."
+        )
 
 
 class StateIndependentStd(nn.Module):

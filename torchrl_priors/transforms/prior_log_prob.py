@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Literal
 
 import torch
@@ -14,7 +15,7 @@ from torchrl_priors.advice import check_advice
 from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
 from torchrl_priors.keys import check_option, next_step, read, under_next
-from torchrl_priors.priors import Prior
+from torchrl_priors.priors import Prior, warn_of_another_teacher
 from torchrl_priors.transforms.batch_transform import BatchTransform
 
 __all__ = ["PriorLogProb"]
@@ -111,6 +112,7 @@ class PriorLogProb(BatchTransform):
             raise ValueError(f"Expected one key for the log-probability, got {out_keys}.")
         super().__init__(in_keys=[*prior.in_keys, prior.action_key], out_keys=out_keys)
         self.prior = prior
+        self.register_load_state_dict_pre_hook(warn_of_another_teacher)
         self.__dict__["actor"] = actor
         self.time_dim = time_dim
         self.boundary = boundary
@@ -126,6 +128,8 @@ class PriorLogProb(BatchTransform):
         """Writes the entries into a batch ``[*B, T]`` and returns it."""
         time_dim = self._find_time_dim(tensordict)
         terminated, has_next, wanted = self._boundaries(tensordict, time_dim)
+        if not torch.compiler.is_compiling():
+            self._warn_of_another_order(tensordict, has_next, time_dim)
         self._draw(tensordict, has_next, time_dim)
 
         params = self.prior.get_params(tensordict)
@@ -181,6 +185,27 @@ class PriorLogProb(BatchTransform):
             has_next = has_next & shift_to_next(mask, False, has_next, terminated, time_dim=time_dim)
             wanted = wanted & mask
         return terminated, has_next, wanted & ~has_next
+
+    def _warn_of_another_order(self, tensordict: TensorDictBase, has_next: Tensor, time_dim: int) -> None:
+        """A batch that was permuted keeps the name of its time dimension: what follows is then not the next step."""
+        follows = has_next.squeeze(-1)
+        for key in self.prior.in_keys:
+            here, after = tensordict.get(key, None), tensordict.get(under_next(key), None)
+            if here is None or after is None or here.shape != after.shape or not follows.any():
+                continue
+            same = (
+                (here.roll(-1, time_dim) == after).flatten(follows.ndim).all(-1)
+                if here.ndim > follows.ndim
+                else (here.roll(-1, time_dim) == after)
+            )
+            if not same[follows].any():
+                warnings.warn(
+                    f"No step of the batch goes on where its next one begins: {key!r} of step t + 1 is never"
+                    f" {under_next(key)!r} of step t along dimension {time_dim}. Was it permuted? Run PriorLogProb"
+                    " before a rollout is flattened, shuffled or augmented.",
+                    stacklevel=4,
+                )
+            return
 
     def _draw(self, tensordict: TensorDictBase, has_next: Tensor, time_dim: int) -> None:
         """Lets the prior draw, the same for the next state of step t and for the state of step t + 1."""
