@@ -86,7 +86,7 @@ def load_sb3_prior(
         one_hot (bool): whether discrete actions are one-hot ``[*B, A]``, not indices ``[*B]``. Defaults to ``False``.
         action_spec (TensorSpec, optional): the student's actions, which must be of the same kind, size and bounds.
             :class:`~torchrl_priors.priors.RescaledPrior` takes a teacher to other bounds, such as those behind
-            ``ActionScaling``. Defaults to ``None``: not checked.
+            :class:`~torchrl.envs.ActionScaling`. Defaults to ``None``: not checked.
         in_key (NestedKey): raw observations ``[*B, *obs]``, images with channels first. Defaults to ``"observation"``.
         namespace (NestedKey): as in :class:`~torchrl_priors.ActionPrior`.
         device (torch.device, optional): defaults to the CPU.

@@ -26,8 +26,8 @@ _Output = Literal["logits", "probs", "mean", "mean_std", "distribution"]
 class ModulePrior(ActionPrior):
     r"""Any :class:`torch.nn.Module` as a teacher. What it returns is said, not guessed.
 
-    Like any :class:`ActionPrior` it copies the network and freezes it. A TorchScript policy (``torch.jit.load``) is
-    such a network too, also after ``torch.jit.freeze``.
+    Like any :class:`ActionPrior` it copies the network and freezes it. A TorchScript policy (:func:`torch.jit.load`) is
+    such a network too, also after :func:`torch.jit.freeze`.
 
     Args:
         module (nn.Module): from the entries ``in_keys`` to ``output``. It gets and returns ``[N, ...]``: the batch is

@@ -19,7 +19,7 @@ __all__ = ["RescaledPrior"]
 class RescaledPrior(PriorWrapper):
     r"""A Gaussian teacher of actions in ``[low, high]`` for a student of the same actions in ``[to_low, to_high]``.
 
-    A student behind TorchRL's ``ActionScaling`` acts in [-1, 1], and its teacher perhaps in the unit
+    A student behind TorchRL's :class:`~torchrl.envs.ActionScaling` acts in [-1, 1], and its teacher perhaps in the unit
     of the environment. Mean and standard deviation are mapped by the line that takes one box to the other:
     :math:`\mu' = f\mu + b`, :math:`\sigma' = f\sigma`; of a :class:`~torchrl.modules.TanhNormal`, the bounds.
 
