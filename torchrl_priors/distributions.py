@@ -9,7 +9,8 @@ from tensordict.nn import CompositeDistribution
 from tensordict.nn.distributions import OneHotCategorical as TensorDictOneHotCategorical
 from torch import Tensor
 from torch import distributions as d
-from torch.compiler import is_compiling
+from torch.compiler import assume_constant_result, is_compiling
+from torch.distributions.kl import _KL_MEMOIZE, _dispatch_kl
 from torchrl.modules import MaskedOneHotCategorical, OneHotCategorical, OneHotOrdinal
 from torchrl.modules.distributions.utils import has_analytic_entropy, has_analytic_kl, rsample_and_log_prob
 
@@ -181,8 +182,25 @@ def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | N
             prior_dist.scale.unsqueeze(-1),
         )
     if has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist):
-        return d.kl_divergence(dist, prior_dist) + dist.entropy()
+        return _kl(dist, prior_dist) + dist.entropy()
     return None
+
+
+def _kl(dist: Any, prior_dist: Any) -> Tensor:
+    """The registered divergence. Which it is can't be traced, so that compiled code looks it up beforehand."""
+    if is_compiling():
+        pair = dist, prior_dist
+        _look_up(type(dist), type(prior_dist))
+        while hasattr(pair[0], "base_dist") and hasattr(pair[1], "base_dist"):
+            pair = pair[0].base_dist, pair[1].base_dist
+            _look_up(type(pair[0]), type(pair[1]))
+    return d.kl_divergence(dist, prior_dist)
+
+
+@assume_constant_result
+def _look_up(kind: type, prior_kind: type) -> bool:
+    _KL_MEMOIZE[kind, prior_kind] = _dispatch_kl(kind, prior_kind)
+    return True
 
 
 def _sample(dist: d.Distribution, num_samples: int | None) -> tuple[Tensor, Tensor]:
@@ -199,7 +217,7 @@ def _estimate(dist: d.Distribution, prior_dist: d.Distribution, num_samples: int
         )
     action, log_prob = _sample(dist, num_samples)
     if has_analytic_kl(dist, prior_dist):
-        return d.kl_divergence(dist, prior_dist) - log_prob.mean(0)
+        return _kl(dist, prior_dist) - log_prob.mean(0)
     return -prior_dist.log_prob(action).mean(0)
 
 
@@ -210,7 +228,7 @@ def _divergence(
     if exact is not None and has_analytic_entropy(dist):
         return exact - dist.entropy()
     if has_analytic_kl(dist, prior_dist):
-        return d.kl_divergence(dist, prior_dist)
+        return _kl(dist, prior_dist)
     action, log_prob = _sample(dist, num_samples)
     return (log_prob - prior_dist.log_prob(action)).mean(0)
 

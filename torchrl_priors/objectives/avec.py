@@ -106,10 +106,11 @@ class AVECMixin:
         if loss_critic_type != "l2":
             raise ValueError(f"AVEC is the variance of the l2 critic loss, got loss_critic_type={loss_critic_type!r}.")
         super().__init__(*args, loss_critic_type=loss_critic_type, **kwargs)  # type: ignore[call-arg]
+        self._has_hook = hasattr(super(), "_critic_loss_inputs")  # PPO's; what is asked here can't be traced
 
     def loss_critic(self: Any, tensordict: TensorDictBase) -> Any:
         """The critic loss of the parent, on targets moved by the mean residual of the minibatch."""
-        if hasattr(super(), "_critic_loss_inputs"):
+        if self._has_hook:
             self._steps = tensordict
             try:
                 return super().loss_critic(tensordict)  # type: ignore[misc]

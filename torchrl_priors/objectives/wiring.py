@@ -38,8 +38,8 @@ class Wiring:
             self.bonus_told = True
             if is_of_another_method(loss, batch, bonus):
                 warnings.warn(
-                    f"The batch has a bonus that is not that of {loss.spec}: make the transforms of the loss,"
-                    " prior_transforms(loss), or give PriorBonus.from_method and the loss the same method.",
+                    f"The batch has a bonus that is not that of {loss.spec.label or loss.spec}: make the transforms of"
+                    " the loss, prior_transforms(loss), or give PriorBonus.from_method and the loss the same method.",
                     stacklevel=4,
                 )
         if not self.advantage_told:

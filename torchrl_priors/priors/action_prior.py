@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from copy import deepcopy
 from functools import partial
 from typing import Any
@@ -22,6 +23,7 @@ from torchrl.modules import Delta, TanhDelta
 
 from torchrl_priors.advice import parameter_fault
 from torchrl_priors.distributions import without_independent
+from torchrl_priors.priors.memory import refuse_hidden_states, without_memory
 from torchrl_priors.priors.prior import Prior
 
 __all__ = ["ActionPrior", "policy_of"]
@@ -45,7 +47,8 @@ class ActionPrior(Prior):
         TypeError: ``module`` is a prior, or gives no distribution (a greedy actor over action values can be a
             :class:`BoltzmannPrior`).
         ValueError: the distribution is a point mass, which has no log-probability to advise with.
-        NotImplementedError: the distribution is a composite of several actions.
+        NotImplementedError: the distribution is a composite of several actions, or the policy has a memory: it reads a
+            hidden state, or, at the first call, it changed a buffer.
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
@@ -66,9 +69,11 @@ class ActionPrior(Prior):
         if isinstance(module, Prior):
             raise TypeError(f"An ActionPrior is made of a policy, and a {type(module).__name__} is a prior already.")
         last = _distribution_module(module)
+        refuse_hidden_states(module)
         names = [key[-1] if isinstance(key, tuple) else key for key in last.dist_keys]
         super().__init__(module.in_keys, names, last.distribution_class, namespace=namespace)
         self.module = deepcopy(module).requires_grad_(False).eval()
+        self._has_run = False
 
     @torch.no_grad()
     def get_params(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
@@ -79,11 +84,14 @@ class ActionPrior(Prior):
         # The policy writes into a tensordict of its own, so that no key of the student is touched.
         private = tensordict.select(*self.in_keys)
         if isinstance(self.module, ProbabilisticTensorDictSequential):
-            try:
-                private = self.module.get_dist_params(private)
-            except RuntimeError as error:
-                self._explain(tensordict, error)
-                raise
+            first = not self._has_run and not is_compiling()
+            with without_memory(self.module) if first else nullcontext():
+                try:
+                    private = self.module.get_dist_params(private)
+                except RuntimeError as error:
+                    self._explain(tensordict, error)
+                    raise
+            self._has_run = self._has_run or first
         keys = _distribution_module(self.module).in_keys
         params = dict(zip(self.param_names, (private.get(key) for key in keys), strict=True))
         if not is_compiling() and (fault := parameter_fault(params)):

@@ -141,8 +141,10 @@ class PriorLogProb(BatchTransform):
         check_advice(value, dist)
 
         at_boundary = torch.zeros_like(value)
-        # only the time steps at which some trajectory was cut
-        steps = wanted.movedim(time_dim, 0).flatten(1).any(-1).nonzero().squeeze(-1)
+        # only the time steps at which some trajectory was cut; all where code is compiled, which looks at no data
+        steps = torch.arange(value.shape[time_dim], device=value.device)
+        if not torch.compiler.is_compiling():
+            steps = steps[wanted.movedim(time_dim, 0).flatten(1).any(-1)]
         if self.boundary != "zero" and len(steps):
             keys = dict.fromkeys([*self.prior.in_keys, *self.__dict__["actor"].in_keys, *self.prior.draw_keys])
             cut = (slice(None),) * time_dim + (steps,)
