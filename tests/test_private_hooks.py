@@ -25,6 +25,7 @@ OF_CLASSES = {
         "_reset_module_parameters",
     ],
     "torchrl.objectives.ClipPPOLoss": ["_critic_loss_inputs", "_get_cur_log_prob", "_set_in_keys"],
+    "torch.Tensor": ["_version"],
     "torch.distributions.kl": ["_KL_MEMOIZE", "_dispatch_kl"],
     "torch": ["_foreach_add_", "_foreach_copy_", "_guards", "_inductor", "_ops", "_subclasses"],
 }

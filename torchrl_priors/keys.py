@@ -44,8 +44,8 @@ def read(tensordict: TensorDictBase, key: NestedKey, hint: str) -> Tensor:
 def next_step(tensordict: TensorDictBase, keys: Iterable[NestedKey], terminated: Tensor) -> TensorDict:
     """What the next step holds under ``keys``, dense, and this step's entries where there is no next observation.
 
-    Environments that reset themselves, and :class:`~torchrl.envs.transforms.NextStateReconstructor`, leave NaN there at
-    any end of a trajectory. This step's entry takes its place, as in TorchRL's :class:`~torchrl.objectives.value.GAE`;
+    Environments that reset themselves, and TorchRL's ``NextStateReconstructor``, leave NaN there at
+    any end of a trajectory. This step's entry takes its place, as in TorchRL's ``GAE``;
     it always does after a termination, where nothing is made of the next state.
 
     Args:
