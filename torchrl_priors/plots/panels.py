@@ -92,11 +92,11 @@ def curve_panels(
             ax.axhline(level, color="0.45", linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1.8)
             ax.annotate(
                 name,
-                (1, level),
+                (0, level),
                 xycoords=("axes fraction", "data"),
-                xytext=(-1, 1.5),
+                xytext=(3, 1.5),
                 textcoords="offset points",
-                ha="right",
+                ha="left",  # where curves begin, most of them far below
                 va="bottom",
                 fontsize=6.5,
                 color="0.35",
