@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import (
-    AddStateIndependentNormalScale,
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -21,14 +19,13 @@ from tensordict.nn import (
 )
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MLP, IndependentNormal, SafeModule, SafeProbabilisticModule
+from torchrl.modules import IndependentNormal, SafeModule, SafeProbabilisticModule
 
-from torchrl_priors.networks import ACTIVATIONS, GaussianMLP
+from torchrl_priors.collectors.dense_policy import DenseGaussian, has_hooks
 
 __all__ = ["GaussianStep", "ModuleStep", "PolicyStep", "policy_step"]
 
 _CHUNK = 256  # steps whose noise is drawn at once
-_ONE_THREAD = 2**18  # multiplications of a matrix product up to which OpenBLAS keeps to one thread
 
 
 class PolicyStep(ABC):
@@ -111,7 +108,7 @@ class GaussianStep(PolicyStep):
         self._generator: torch.Generator | None = None
         self._noise: Iterator[Any] = iter(())
         self._deterministic = False
-        self._dense: _DenseGaussian | None = None
+        self._dense: DenseGaussian | None = None
         self._outputs: dict[NestedKey, Tensor] = {}  # of a dense network: the same in all steps of a session
 
     @contextmanager
@@ -123,11 +120,11 @@ class GaussianStep(PolicyStep):
         with torch.no_grad():
             yield
 
-    def _find_dense(self) -> _DenseGaussian | None:
+    def _find_dense(self) -> DenseGaussian | None:
         (module, in_keys, out_keys), *more = self._body
         if more or len(in_keys) != 1 or out_keys != (self._loc, self._scale):
             return None
-        return _DenseGaussian.of(module)
+        return DenseGaussian.of(module)
 
     def __call__(self, inputs: dict[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
         """See :class:`PolicyStep`."""
@@ -155,7 +152,7 @@ class GaussianStep(PolicyStep):
             del values[key]
         return values
 
-    def _call_dense(self, dense: _DenseGaussian, observation: Tensor) -> dict[NestedKey, Tensor]:
+    def _call_dense(self, dense: DenseGaussian, observation: Tensor) -> dict[NestedKey, Tensor]:
         dense(observation)
         if not self._outputs:
             action = dense.loc if self._deterministic else torch.empty_like(dense.loc)
@@ -179,105 +176,6 @@ class GaussianStep(PolicyStep):
             with torch.no_grad():
                 distribution = self._head.get_dist(batch)
                 batch.set(self._head.log_prob_key, distribution.log_prob(batch.get(self.action_key)))
-
-
-class _DenseGaussian:
-    """A small dense network with a state-independent scale, computed by NumPy on memory that stays.
-
-    The parameters are used where they are. NumPy's calls take a third of the time of PyTorch's, on such small matrices;
-    larger ones, which its matrix product would spread over threads, are refused by :meth:`prepare`.
-
-    Args:
-        layers (list): linear layers, each with the activation that follows it, if one does.
-        scale (AddStateIndependentNormalScale): the last layer.
-    """
-
-    loc: Tensor
-    scale: Tensor
-
-    def __init__(
-        self, layers: list[tuple[nn.Linear, nn.Module | None]], scale_layer: AddStateIndependentNormalScale
-    ) -> None:
-        self._layers = layers
-        self._scale_layer = scale_layer
-        self._steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, Callable[..., object] | None]] = []
-        self._source: Tensor | None = None
-        self._input = np.empty(0)
-
-    @classmethod
-    def of(cls, module: nn.Module) -> _DenseGaussian | None:
-        """That of a module; None if there is more to it."""
-        found = _layers(module)
-        if not found or not isinstance(scale_layer := found.pop(), AddStateIndependentNormalScale):
-            return None
-        layers: list[tuple[nn.Linear, nn.Module | None]] = []
-        for layer in found:
-            if isinstance(layer, nn.Linear):
-                layers.append((layer, None))
-            elif type(layer) in ACTIVATIONS.values() and layers and layers[-1][1] is None:
-                layers[-1] = (layers[-1][0], layer)
-            else:
-                return None
-        plain = all(layer.weight.dtype == torch.float32 and layer.weight.device.type == "cpu" for layer, _ in layers)
-        return cls(layers, scale_layer) if layers and plain else None
-
-    def prepare(self, observation: Tensor) -> bool:
-        """Takes memory for observations ``[N, features]`` such as this one; False if they are others, or too many."""
-        if observation.ndim != 2 or observation.dtype != torch.float32:
-            return False
-        rows = len(observation)
-        if any(rows * layer.in_features * layer.out_features > _ONE_THREAD for layer, _ in self._layers):
-            return False
-        for layer, activation in self._layers:
-            self.loc = torch.empty(rows, layer.out_features)
-            bias = torch.zeros(layer.out_features) if layer.bias is None else layer.bias.detach()
-            function = None if activation is None else _in_place(activation, self.loc)
-            self._steps.append((layer.weight.detach().t().numpy(), bias.numpy(), self.loc.numpy(), function))
-        self.scale = self._scale_layer(self.loc)[1].contiguous()
-        return True
-
-    def __call__(self, observation: Tensor) -> None:
-        """Writes the mean at observations ``[N, features]`` into ``loc``."""
-        if observation is not self._source:
-            self._source, self._input = observation, observation.numpy()
-        x = self._input
-        for weight, bias, out, function in self._steps:
-            np.matmul(x, weight, out=out)
-            np.add(out, bias, out=out)
-            if function is not None:
-                function(out, out=out)
-            x = out
-
-
-def _in_place(activation: nn.Module, tensor: Tensor) -> Callable[..., object]:
-    """What applies an activation to the memory of a tensor, called as a ufunc on its array."""
-    if type(activation) is nn.Tanh:
-        return np.tanh
-    if type(activation) is nn.ReLU:
-        return partial(np.maximum, np.float32(0))
-    return lambda array, out: tensor.copy_(activation.forward(tensor))
-
-
-def _layers(module: nn.Module) -> list[nn.Module] | None:
-    """The layers of a dense network, one after the other; None if a module may do more than its class says."""
-    if _has_hooks(module) or "forward" in vars(module):
-        return None
-    if type(module) is GaussianMLP:
-        children: list[nn.Module] = [module.mean, module.scale]
-    elif isinstance(module, nn.Sequential) and type(module) in (nn.Sequential, MLP):
-        if getattr(module, "_reshape_out", False):
-            return None
-        children = list(module)
-    else:
-        plain = (nn.Linear, AddStateIndependentNormalScale, *ACTIVATIONS.values())
-        return [module] if type(module) in plain else None
-    layers: list[nn.Module] = []
-    for child in children:
-        found = _layers(child)
-        if found is None:
-            return None
-        layers += found
-    return layers
 
 
 def policy_step(policy: TensorDictModuleBase, action_key: NestedKey, input_keys: Sequence[NestedKey]) -> PolicyStep:
@@ -307,10 +205,10 @@ def _gaussian_parts(
     policy: TensorDictModuleBase,
 ) -> tuple[list[TensorDictModule], ProbabilisticTensorDictModule] | None:
     """The modules of a Gaussian policy that may be called without tensordicts; None if there is more to it."""
-    if not isinstance(policy, ProbabilisticTensorDictSequential) or _has_hooks(policy):
+    if not isinstance(policy, ProbabilisticTensorDictSequential) or has_hooks(policy):
         return None
     *body, head = _flat(policy)
-    if type(head) not in (ProbabilisticTensorDictModule, SafeProbabilisticModule) or _has_hooks(head):
+    if type(head) not in (ProbabilisticTensorDictModule, SafeProbabilisticModule) or has_hooks(head):
         return None
     plain_head = (
         head.distribution_class is IndependentNormal
@@ -322,7 +220,7 @@ def _gaussian_parts(
     )
     plain_body = all(
         type(module) in (TensorDictModule, SafeModule)
-        and not _has_hooks(module)
+        and not has_hooks(module)
         and isinstance(module.module, nn.Module)
         and module.method is None
         and not module.method_kwargs
@@ -336,7 +234,3 @@ def _flat(module: TensorDictModuleBase) -> list[TensorDictModuleBase]:
     if not isinstance(module, TensorDictSequential):
         return [module]
     return [part for child in module.module for part in _flat(child)]
-
-
-def _has_hooks(module: nn.Module) -> bool:
-    return bool(module._forward_hooks or module._forward_pre_hooks)
