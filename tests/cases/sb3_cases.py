@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import json
 import warnings
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -106,3 +110,30 @@ def save_model(name: str, folder: Path, steps: int = 32) -> Saved:
         env.save(str(path))
         env.training = False
     return Saved(folder / f"{name}.zip", path, model, env)
+
+
+def renamed(weights: dict[str, Any], old: str, new: str) -> dict[str, Any]:
+    return {name.replace(old, new): value for name, value in weights.items()}
+
+
+def rewrite(
+    source: Path,
+    target: Path,
+    *,
+    weights: Callable[[Any], Any] = lambda w: w,
+    data: Callable[[Any], Any] = lambda d: d,
+    legacy: bool = False,
+) -> Path:
+    """A copy of a model with other content."""
+    with zipfile.ZipFile(source) as archive, zipfile.ZipFile(target, "w") as out:
+        for name in archive.namelist():
+            content = archive.read(name)
+            if name == "policy.pth":
+                buffer = io.BytesIO()
+                changed = weights(torch.load(io.BytesIO(content), weights_only=True))
+                torch.save(changed, buffer, _use_new_zipfile_serialization=not legacy)
+                content = buffer.getvalue()
+            if name == "data":
+                content = json.dumps(data(json.loads(content))).encode()
+            out.writestr(name, content)
+    return target
