@@ -52,7 +52,8 @@ class TestRefusals:
                 {},
                 MyPolicy,
                 {},
-                r"policy class is one of test_sb3_refusals, and only those of PPO, .* CallablePrior\(lambda o: model.predict",
+                r"policy class is one of test_sb3_refusals, and only those of PPO, "
+                r".* CallablePrior\(lambda o: model.predict",
             ),
             ({}, "MlpPolicy", {"policy_kwargs": {"activation_fn": nn.Hardtanh}}, "Hardtanh"),
         ],
