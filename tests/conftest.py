@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -65,3 +66,19 @@ def without_torchrls_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     store = pytest.importorskip("hydra.core.config_store").ConfigStore.instance()
     repo = {name: node for name, node in store.repo.items() if name in ("hydra", "schema") or name.endswith(".yaml")}
     monkeypatch.setattr(store, "repo", repo)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Any]:
+    """Models of Stable-Baselines3, saved once for each file of tests."""
+    from sb3_cases import save_model
+
+    folder = tmp_path_factory.mktemp("sb3")
+    models: dict[str, Any] = {}
+
+    def get(name: str) -> Any:
+        if name not in models:
+            models[name] = save_model(name, folder)
+        return models[name]
+
+    return get
