@@ -2,7 +2,7 @@
 VENV ?= .venv
 BIN = $(if $(wildcard $(VENV)/bin/python),$(VENV)/bin/,)
 
-.PHONY: setup check format docs inventories test test-min
+.PHONY: setup check format docs inventories test test-min test-pythons test-next
 
 setup:  ## create .venv with everything a contributor needs
 	python3 -m venv $(VENV)
@@ -30,3 +30,12 @@ test-min:  ## the same with the oldest supported versions, in an environment of 
 	python3 -m venv $(VENV)-min
 	$(VENV)-min/bin/pip install -c constraints-min.txt -e '.[test]'
 	$(VENV)-min/bin/python -m pytest -n auto
+
+test-pythons:  ## the same on the other Pythons, where they are installed
+	for version in 3.10 3.12; do .ci/python $$version || [ $$? -eq 77 ] || exit 1; done
+
+test-next:  ## the same with the newest releases of all, whatever pyproject.toml allows; may fail
+	python3 -m venv $(VENV)-next
+	$(VENV)-next/bin/pip install -e '.[test]'
+	$(VENV)-next/bin/pip install --upgrade --pre torch tensordict torchrl
+	$(VENV)-next/bin/python -m pytest -n auto

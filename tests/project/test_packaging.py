@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -36,3 +37,26 @@ def test_the_wheel_holds_the_library_and_nothing_else(tmp_path: Path) -> None:
     packages = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert packages == {"torchrl_priors"}
     assert "torchrl_priors/py.typed" in names
+
+
+@pytest.mark.parametrize("address", ["https://forge.example/us/priors", None])
+def test_a_package_index_shows_a_readme_whose_links_lead_somewhere(
+    address: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core, manager = pytest.importorskip("hatchling.metadata.core"), pytest.importorskip("hatchling.plugin.manager")
+    monkeypatch.delenv("REPOSITORY_URL", raising=False)
+    if address is not None:
+        monkeypatch.setenv("REPOSITORY_URL", address)
+    metadata = core.ProjectMetadata(str(ROOT), manager.PluginManager()).core
+    links = re.findall(r"\]\(([^)#]+)\)", metadata.readme)
+    relative = [link for link in links if "://" not in link]
+    assert links
+    assert (not relative) == (address is not None)
+    assert {"Paper"} | ({"Repository", "Documentation", "Changelog", "Issues"} if address else set()) == set(
+        metadata.urls
+    )
+    if address is not None:
+        files = [link.split(f"/v{metadata.version}/")[1] for link in links if link.startswith(address)]
+        assert files
+        assert [file for file in files if not (ROOT / file).exists()] == []
+        assert f"![Learning curves]({address}/raw/v{metadata.version}/results/" in metadata.readme

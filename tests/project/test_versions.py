@@ -44,8 +44,9 @@ def test_the_lower_bounds_are_the_oldest_versions_tested() -> None:
     }
 
 
-def test_the_newest_versions_tested_are_not_older() -> None:
-    newest = pins("constraints.txt")
+@pytest.mark.parametrize("name", ["constraints.txt", "constraints-newest.txt"])
+def test_the_newest_versions_tested_are_not_older(name: str) -> None:
+    newest = pins(name)
     assert [
         name for name, version in pins("constraints-min.txt").items() if release(newest[name]) < release(version)
     ] == []
