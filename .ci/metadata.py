@@ -1,7 +1,7 @@
 """What the package's metadata says of its repository, which only who publishes it knows.
 
-The publishing workflow puts its address into ``REPOSITORY_URL``. Its pages become the project's URLs, and relative links of
-the README become absolute, for a package index shows it without the files beside it.
+The publishing workflow puts its address into ``REPOSITORY_URL``. Its pages become the project's URLs, and relative
+links of the README become absolute, for a package index shows it without the files beside it.
 """
 
 from __future__ import annotations
