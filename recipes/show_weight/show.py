@@ -10,12 +10,12 @@ import numpy as np
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
+from recipes import plots
 from recipes.common.checks import check_keys
 from recipes.gridworld.run_parts import parse_prior
 from recipes.gridworld.study import TaughtWorld, make_learner
 from recipes.report.runs import is_gridworld
 from recipes.show_weight.source import read_config, reading
-from torchrl_priors import plots
 from torchrl_priors.methods import get_method
 
 

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
@@ -236,34 +233,6 @@ def test_agent_sees_the_window_that_the_worlds_are_numbered_by(window):
     for some in (worlds, worlds[1:], torch.cat([worlds, worlds]), worlds.to("cpu")):
         seen = GridWorldEnv(some).reset()["observation"]
         assert seen.shape == (len(some), window, window)
-
-
-def pixels(figure: Figure) -> np.ndarray:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())
-
-
-def test_render_draws_the_world_that_was_asked_for():
-    env = small_env(2)
-    first, second = pixels(env.render()), pixels(env.render(1))
-    assert np.array_equal(pixels(env.render(0)), first)
-    assert not np.array_equal(first, second)
-
-
-@pytest.mark.parametrize(
-    "overlay",
-    [
-        {"policy": torch.zeros(49, dtype=torch.int64)},
-        {"prior_weight": torch.full((49,), 0.5)},
-        {"degraded": torch.ones(49, dtype=torch.bool)},
-    ],
-)
-def test_render_takes_overlays_per_cell(overlay):
-    env = small_env(1)
-    figure = env.render(**overlay)
-    assert isinstance(figure, Figure)
-    assert not np.array_equal(pixels(figure), pixels(env.render()))
 
 
 @pytest.mark.parametrize("action", [-1, 4])

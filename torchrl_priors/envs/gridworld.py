@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,9 +11,6 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_priors.envs.worlds import KINDS, GridWorlds, windows
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["GridMaps", "GridWorldEnv", "transition"]
 
@@ -197,26 +194,3 @@ class GridWorldEnv(EnvBase):
     def set_extra_state(self, state: Tensor) -> None:
         """Restores it."""
         self.generator.set_state(state.cpu())
-
-    def render(self, world: int = 0, **overlays: Any) -> Figure:
-        """Picture of one world: start, walls, terminal cells and rewards; returns a matplotlib figure.
-
-        Args:
-            world (int): which of the batch.
-            overlays: ``policy``, ``prior_weight`` and ``degraded`` per cell, as in
-                :func:`torchrl_priors.plots.grid_world`; tensors of ``C`` cells are accepted.
-        """
-        from torchrl_priors.plots import grid_world
-
-        size, one = self.worlds.size, self.worlds[world].cpu()
-
-        def square(values: Any) -> Any:
-            return None if values is None else torch.as_tensor(values).cpu().view(size, size).numpy()
-
-        return grid_world(
-            square(one.kind == 1),
-            square(one.reward),
-            square(one.terminal),
-            divmod(int(one.start), size),
-            **{name: square(values) for name, values in overlays.items()},
-        )

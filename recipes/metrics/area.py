@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_priors.metrics.interval import as_array, unwrap
+from recipes.metrics.interval import as_array, unwrap
 
 __all__ = ["RATIO_LIMIT", "area_ratio", "area_under_curve"]
 

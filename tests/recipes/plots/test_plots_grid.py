@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patches import Rectangle
 from test_plots import world
 
-from torchrl_priors.plots import (
-    grid_world,
-)
+from recipes.plots import draw_world, grid_world
+from torchrl_priors.envs import sample_worlds
 
 
 class TestGridWorld:
@@ -33,24 +33,9 @@ class TestGridWorld:
         bottom, top = grid_world(**world()).axes[0].get_ylim()
         assert (bottom, top) == (5, 0)
 
-    @pytest.mark.parametrize(("action", "step"), [(0, (0, -1)), (1, (1, 0)), (2, (0, 1)), (3, (-1, 0))])
-    @pytest.mark.parametrize("cell", [(3, 3), (2, 2)], ids=["free", "with a reward"])
-    def test_arrowheads_point_where_the_action_leads(self, action, step, cell):
-        policy = np.full((5, 6), -1)
-        policy[cell] = action
-        (head,) = [
-            patch for patch in grid_world(**world(), policy=policy).axes[0].patches if isinstance(patch, Polygon)
-        ]
-        tip, *base = head.get_xy()[:3]
-        direction = tip - np.mean(base, axis=0)
-        np.testing.assert_allclose(direction / np.linalg.norm(direction), step, atol=1e-9)
-        assert ((head.get_xy() >= np.array(cell)[::-1]) & (head.get_xy() <= np.array(cell)[::-1] + 1)).all()
-
-    def test_only_free_cells_get_arrowheads_and_degradation(self):
-        everywhere = np.ones((5, 6))
-        patches = grid_world(**world(), policy=everywhere, degraded=everywhere).axes[0].patches
+    def test_only_free_cells_are_marked_as_degraded(self):
+        patches = grid_world(**world(), degraded=np.ones((5, 6))).axes[0].patches
         free = 30 - 2 - 2  # walls, terminals
-        assert sum(isinstance(patch, Polygon) and not isinstance(patch, Rectangle) for patch in patches) == free
         assert sum(isinstance(patch, Rectangle) and bool(patch.get_hatch()) for patch in patches) == free
 
     def test_larger_weights_are_darker_and_unknown_ones_white(self):
@@ -76,8 +61,7 @@ class TestGridWorld:
         ("change", "message"),
         [
             ({"rewards": np.zeros((6, 5))}, r"rewards has shape \(6, 5\)"),
-            ({"policy": np.zeros(30)}, r"policy needs the shape \[H, W\]"),
-            ({"policy": np.full((5, 6), 4)}, "actions from 4 to 4"),
+            ({"terminal": np.zeros(30)}, r"terminal needs the shape \[H, W\]"),
             ({"prior_weight": np.full((5, 6), 1.5)}, "outside"),
             ({"degraded": np.zeros((1, 6))}, "degraded has shape"),
             ({"start": (0, 0)}, "in a wall"),
@@ -87,3 +71,24 @@ class TestGridWorld:
     def test_maps_that_do_not_fit_are_refused(self, change, message):
         with pytest.raises(ValueError, match=message):
             grid_world(**{**world(), **change})
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
+
+
+class TestDrawWorld:
+    worlds = sample_worlds(torch.arange(2), size=7, window=3, object_prob=0.03)
+
+    def test_the_world_that_was_asked_for_is_drawn(self):
+        first, second = pixels(draw_world(self.worlds)), pixels(draw_world(self.worlds, 1))
+        assert np.array_equal(pixels(draw_world(self.worlds, 0)), first)
+        assert not np.array_equal(first, second)
+
+    @pytest.mark.parametrize(
+        "overlay", [{"prior_weight": torch.full((49,), 0.5)}, {"degraded": torch.ones(49, dtype=torch.bool)}]
+    )
+    def test_overlays_per_cell_are_drawn(self, overlay):
+        assert not np.array_equal(pixels(draw_world(self.worlds, **overlay)), pixels(draw_world(self.worlds)))

@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from torchrl_priors.plots.grid import add_legend, add_weight_scale, grid_world
-from torchrl_priors.plots.style import (
+from recipes.plots.grid import add_legend, add_weight_scale, grid_world
+from recipes.plots.style import (
     TEXT_WIDTH,
     line_style,
     method_color,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from torchrl_priors.plots import episode_weights, weight_curves, weight_maps
-from torchrl_priors.plots.video import write_weight_video
+from recipes.plots import episode_weights, weight_curves, weight_maps
+from recipes.plots.video import write_weight_video
 
 GRID = np.zeros((3, 4))
 WORLD = {"walls": GRID, "rewards": GRID, "terminal": GRID, "start": (1, 1)}

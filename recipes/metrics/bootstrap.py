@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_priors.metrics.interval import CHUNK, ConfidenceInterval, as_array, as_scores, interval, tails, unwrap
+from recipes.metrics.interval import CHUNK, ConfidenceInterval, as_array, as_scores, interval, tails, unwrap
 
 __all__ = ["iqm", "mean_confidence_interval", "stratified_bootstrap_ci"]
 

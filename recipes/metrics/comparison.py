@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from torchrl_priors.metrics.bootstrap import stratified_bootstrap_ci
-from torchrl_priors.metrics.interval import CHUNK, Array, ConfidenceInterval, as_array, as_scores, interval, tails
+from recipes.metrics.bootstrap import stratified_bootstrap_ci
+from recipes.metrics.interval import CHUNK, Array, ConfidenceInterval, as_array, as_scores, interval, tails
 
 __all__ = ["performance_profile", "probability_of_improvement"]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import curve_panels, interval_panels, method_color, profile_panels
-from torchrl_priors.plots.variants import variant_label, variant_styles
+from recipes.metrics import ConfidenceInterval
+from recipes.plots import curve_panels, interval_panels, method_color, profile_panels
+from recipes.plots.variants import variant_label, variant_styles
 
 STEPS = np.arange(1.0, 4.0)
 BAND = ConfidenceInterval(STEPS, STEPS - 1, STEPS + 1)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from torchrl_priors.metrics import (
+from recipes.metrics import (
     RATIO_LIMIT,
     area_ratio,
     area_under_curve,
@@ -161,7 +161,7 @@ class TestBootstrap:
             probability_of_improvement(scores, scores[:7] + 0.1, reps=101),
         )
         for module in ("bootstrap", "comparison"):
-            monkeypatch.setattr(f"torchrl_priors.metrics.{module}.CHUNK", 26 * 40)
+            monkeypatch.setattr(f"recipes.metrics.{module}.CHUNK", 26 * 40)
         np.testing.assert_allclose(stratified_bootstrap_ci(scores, reps=101), whole[0])
         chunked = probability_of_improvement(scores, scores[:7] + 0.1, reps=101)
         np.testing.assert_allclose(chunked, whole[1], atol=0.05)  # two draws a chunk: another order, the same law

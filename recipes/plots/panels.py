@@ -1,6 +1,6 @@
 """Panels of methods and their variants, for each environment, teacher or prior: curves, profiles and intervals.
 
-A method may come with settings, as in ``"ae2r Cω=0.03"``: see :mod:`torchrl_priors.plots.variants`.
+A method may come with settings, as in ``"ae2r Cω=0.03"``: see :mod:`recipes.plots.variants`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator, PercentFormatter
 
-from torchrl_priors.metrics import MIN_RUNS, ConfidenceInterval, performance_profile
-from torchrl_priors.plots.style import (
+from recipes.metrics import MIN_RUNS, ConfidenceInterval, performance_profile
+from recipes.plots.style import (
     COLUMN_WIDTH,
     TEXT_WIDTH,
     new_figure,
@@ -24,7 +24,7 @@ from torchrl_priors.plots.style import (
     paper_style,
     thousands,
 )
-from torchrl_priors.plots.variants import variant_label, variant_styles
+from recipes.plots.variants import variant_label, variant_styles
 
 __all__ = ["curve_panels", "interval_panels", "profile_panels"]
 
@@ -116,7 +116,6 @@ def profile_panels(
     panels: Mapping[str, Mapping[str, Any]],
     thresholds: Any = None,
     *,
-    columns: int | None = None,
     confidence: float = 0.95,
     reps: int = 2000,
     seed: int = 0,
@@ -131,7 +130,6 @@ def profile_panels(
             and at most 10.
 
     Keyword Args:
-        columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
         confidence (float): of the stratified bootstrap bands. Defaults to 0.95.
         reps (int): resamples. Defaults to 2000.
         seed (int): of the resampling. Defaults to 0.
@@ -148,7 +146,7 @@ def profile_panels(
         2
     """
     styles = variant_styles(_names(panels))
-    figure, axes = _panels(panels, columns, None, row_height=1.75)
+    figure, axes = _panels(panels, None, None, row_height=1.75)
     if thresholds is None:
         every = np.concatenate([np.ravel(scores) for profiles in panels.values() for scores in profiles.values()])
         thresholds = np.linspace(-1, min(10.0, max(1.0, np.ceil(4 * np.quantile(every, 0.98)) / 4)), 401)
@@ -178,7 +176,6 @@ def interval_panels(
     places: Places | None = None,
     scale: float = 1.0,
     reference: Mapping[str, Mapping[str, ConfidenceInterval]] | None = None,
-    reference_label: str = "Paper",
     xlabel: str = r"IQM of $r_{\pi_0}$",
     xlim: tuple[float, float] | None = None,
     baseline: str | None = None,
@@ -193,8 +190,7 @@ def interval_panels(
         columns (int, optional): panels in a row. Defaults to as many as there are, at most 3.
         places (mapping, optional): row and column of each title, in the place of ``columns``.
         scale (float): what values are multiplied with before they are drawn. Defaults to 1.
-        reference (mapping, optional): other values to compare with, by title and method; their ends are whiskers.
-        reference_label (str): their name in the legend. Defaults to ``"Paper"``.
+        reference (mapping, optional): the paper's values, by title and method; their ends are whiskers.
         xlabel (str): name of the axis.
         xlim (tuple of float, optional): one scale for all panels; else each has its own, which holds the centre.
         baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
@@ -242,7 +238,7 @@ def interval_panels(
     if reference:
         bar, line = Patch(color="0.6", linewidth=0, label="Interval"), {**_MARKER, "marker": "|", "markersize": 8}
         handles: list[Any] = [Line2D([], [], label="Estimate", **line), bar]
-        handles.append(Line2D([], [], label=reference_label, **_MARKER))
+        handles.append(Line2D([], [], label="Paper", **_MARKER))
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), columnspacing=1.6)
     return figure
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.colors import to_hex, to_rgb
 
-from torchrl_priors.plots.style import BASELINE, line_style, method_label
+from recipes.plots.style import BASELINE, line_style, method_label
 
 __all__ = ["variant_label", "variant_styles"]
 

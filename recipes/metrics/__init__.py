@@ -6,10 +6,10 @@ device), and draws from a :class:`numpy.random.Generator` of its own: the same s
 ran before.
 """
 
-from torchrl_priors.metrics.area import RATIO_LIMIT, area_ratio, area_under_curve
-from torchrl_priors.metrics.bootstrap import iqm, mean_confidence_interval, stratified_bootstrap_ci
-from torchrl_priors.metrics.comparison import performance_profile, probability_of_improvement
-from torchrl_priors.metrics.interval import MIN_RUNS, ConfidenceInterval
+from recipes.metrics.area import RATIO_LIMIT, area_ratio, area_under_curve
+from recipes.metrics.bootstrap import iqm, mean_confidence_interval, stratified_bootstrap_ci
+from recipes.metrics.comparison import performance_profile, probability_of_improvement
+from recipes.metrics.interval import MIN_RUNS, ConfidenceInterval
 
 __all__ = [
     "MIN_RUNS",

@@ -11,17 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patches import Patch, Rectangle
 
-from torchrl_priors.plots.style import COLUMN_WIDTH, new_figure, paper_style
+from recipes.plots.style import COLUMN_WIDTH, new_figure, paper_style
+from torchrl_priors.envs import GridWorlds
 
-__all__ = ["grid_world"]
+__all__ = ["draw_world", "grid_world"]
 
 _START, _WALL, _TERMINAL, _EMPTY, _DEGRADED, _LINES = "#4C84C4", "#111111", "#5FB56A", "#FFFFFF", "#C8102E", "#D4D4D4"
 _INK = "#111111"
 # not from white on: a weight of 0 is not a cell without a weight
 _WEIGHT_MAP = ListedColormap(colormaps["Purples"](np.linspace(0.12, 1, 256)), "weights")
-_DIRECTIONS = ((0, -1), (1, 0), (0, 1), (-1, 0))  # x right, y down: up, right, down, left
 
 Colors = npt.NDArray[np.float64]
 
@@ -33,7 +33,6 @@ def grid_world(
     terminal: Any,
     start: tuple[int, int],
     *,
-    policy: Any = None,
     prior_weight: Any = None,
     degraded: Any = None,
     title: str | None = None,
@@ -50,7 +49,6 @@ def grid_world(
         start: row and column of the first state.
 
     Keyword Args:
-        policy: action per cell as int ``[H, W]``, drawn as an arrowhead: 0 up, 1 right, 2 down, 3 left; -1 for none.
         prior_weight: weight in [0, 1] per cell, ``[H, W]``, drawn in shades of purple with a scale; NaN for none.
         degraded: bool, ``[H, W]``: cells where the prior is degraded, hatched and framed in red.
         title (str, optional): printed above.
@@ -62,8 +60,8 @@ def grid_world(
         Figure: the figure drawn into.
 
     Raises:
-        ValueError: the arrays aren't of one shape ``[H, W]``, the start lies outside or in a wall, or an action or a
-            weight is out of range.
+        ValueError: the arrays aren't of one shape ``[H, W]``, the start lies outside or in a wall, or a weight is outside
+            [0, 1].
 
     Examples:
         >>> walls, rewards = np.zeros((3, 3), bool), np.zeros((3, 3))
@@ -74,13 +72,10 @@ def grid_world(
     """
     walls, terminal = _layer(walls, bool, "walls"), _layer(terminal, bool, "terminal")
     rewards = _layer(rewards, np.float64, "rewards")
-    policy = None if policy is None else _layer(policy, np.int64, "policy")
     weight = None if prior_weight is None else _layer(prior_weight, np.float64, "prior_weight")
     degraded = np.zeros_like(walls) if degraded is None else _layer(degraded, bool, "degraded")
     row, column = (int(index) for index in start)
-    _check(
-        walls, (row, column), rewards=rewards, terminal=terminal, policy=policy, prior_weight=weight, degraded=degraded
-    )
+    _check(walls, (row, column), rewards=rewards, terminal=terminal, prior_weight=weight, degraded=degraded)
     height, width = walls.shape
     free = ~walls & ~terminal
 
@@ -107,10 +102,28 @@ def grid_world(
     for r, c in np.argwhere(degraded & free):
         ax.add_patch(_outline(r, c, _DEGRADED, cell, hatch="////"))
     _draw_numbers(ax, np.where(walls, 0.0, rewards), colors, cell)
-    if policy is not None:
-        for r, c in np.argwhere(free & (policy >= 0)):
-            ax.add_patch(_arrowhead(r, c, _DIRECTIONS[policy[r, c]], aside=rewards[r, c] != 0, ink=_ink(colors[r, c])))
     return figure
+
+
+def draw_world(worlds: GridWorlds, index: int = 0, **overlays: Any) -> Figure:
+    """One world of a batch as :func:`grid_world` draws it.
+
+    Args:
+        worlds (GridWorlds): the batch.
+        index (int): which of them.
+        overlays: ``prior_weight`` and ``degraded``, of each cell, ``[C]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_priors.envs import sample_worlds
+        >>> worlds = sample_worlds(torch.arange(2), size=7, window=3)
+        >>> len(draw_world(worlds, 1, prior_weight=torch.full((49,), 0.5)).axes)  # the map and the scale
+        2
+    """
+    size, world = worlds.size, worlds[index].cpu()
+    layers = {"walls": world.kind == 1, "rewards": world.reward, "terminal": world.terminal, **overlays}
+    squares = {name: np.asarray(layer).reshape(size, size) for name, layer in layers.items()}
+    return grid_world(**squares, start=divmod(int(world.start), size))
 
 
 def _check(walls: Any, start: tuple[int, int], **layers: Any) -> None:
@@ -121,9 +134,7 @@ def _check(walls: Any, start: tuple[int, int], **layers: Any) -> None:
     row, column = start
     if not (0 <= row < walls.shape[0] and 0 <= column < walls.shape[1]) or walls[start]:
         raise ValueError(f"start {start} is outside the {walls.shape} grid or in a wall.")
-    policy, weight = layers["policy"], layers["prior_weight"]
-    if policy is not None and (policy.min() < -1 or policy.max() > 3):
-        raise ValueError(f"policy holds actions from {policy.min()} to {policy.max()}, expected -1 to 3.")
+    weight = layers["prior_weight"]
     if weight is not None and not (np.isnan(weight) | ((weight >= 0) & (weight <= 1))).all():
         raise ValueError("prior_weight holds values outside [0, 1].")
 
@@ -182,16 +193,6 @@ def _draw_numbers(ax: Axes, rewards: Any, colors: Colors, cell: float) -> None:
     for (r, c), text in texts.items():
         ink = _ink(colors[r, c])
         ax.text(c + 0.5, r + 0.52, text, ha="center", va="center_baseline", fontsize=size, color=ink, zorder=4)
-
-
-def _arrowhead(row: int, column: int, direction: tuple[int, int], aside: bool, ink: str) -> Polygon:
-    """A triangle in the middle of a cell, or at the edge it points to where the middle is taken by a number."""
-    forward = np.array(direction, dtype=np.float64)
-    sideways = np.array([-forward[1], forward[0]])
-    length, width = (0.16, 0.3) if aside else (0.42, 0.4)
-    tip = np.array([column + 0.5, row + 0.5]) + forward * (0.46 if aside else length / 2)
-    corners = [tip, tip - length * forward + width / 2 * sideways, tip - length * forward - width / 2 * sideways]
-    return Polygon(corners, closed=True, facecolor=ink, linewidth=0, zorder=3)
 
 
 def _set_frame(ax: Axes, shape: tuple[int, int], title: str | None) -> None:

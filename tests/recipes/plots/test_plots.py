@@ -13,14 +13,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from torchrl_priors.methods import METHODS, MethodSpec
-from torchrl_priors.metrics import (
+from recipes.metrics import (
     ConfidenceInterval,
     mean_confidence_interval,
     performance_profile,
     stratified_bootstrap_ci,
 )
-from torchrl_priors.plots import (
+from recipes.plots import (
     curve_panels,
     grid_world,
     interval_panels,
@@ -31,6 +30,7 @@ from torchrl_priors.plots import (
     save_figure,
     style,
 )
+from torchrl_priors.methods import METHODS, MethodSpec
 
 PRIORS = ["expert", "random_15", "random_30", "random_50", "structural_3", "structural_5", "structural_10"]
 STEPS = np.arange(1, 31) * 1000
@@ -109,7 +109,6 @@ FIGURES = {
     ),
     "world": lambda: grid_world(
         **world(),
-        policy=np.ones((5, 6), int),
         prior_weight=np.full((5, 6), 0.3),
         degraded=np.eye(5, 6, dtype=bool),
         title="World 3",
@@ -139,8 +138,8 @@ def test_matplotlib_settings_are_left_alone(name, tmp_path):
 def test_pyplot_is_never_imported():
     code = """
 import sys
-from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import interval_panels, save_figure
+from recipes.metrics import ConfidenceInterval
+from recipes.plots import interval_panels, save_figure
 import tempfile
 with tempfile.TemporaryDirectory() as folder:
     save_figure(interval_panels({"expert": {"er": ConfidenceInterval(1.0, 0.5, 2.0)}}), folder + "/x")
@@ -243,12 +242,11 @@ class TestIntervals:
         figure = interval_panels(
             {"expert": {"er": ConfidenceInterval(0.1, 0.0, 0.2), "ae2r": ConfidenceInterval(0.3, 0.2, 0.4)}},
             reference={"expert": {"ae2r": ConfidenceInterval(0.036, 0.025, 0.05)}, "other": {}},
-            reference_label="Published",
             scale=1e3,
         )
         marker = next(entry for entry in figure.axes[0].lines if entry.get_marker() == "D")
         assert (marker.get_xdata()[0], marker.get_ydata()[0]) == (pytest.approx(36), 1)
-        assert "Published" in [text.get_text() for text in figure.legends[0].get_texts()]
+        assert "Paper" in [text.get_text() for text in figure.legends[0].get_texts()]
 
     @pytest.mark.parametrize("value", [0.5, -0.5])
     def test_zero_and_every_bar_are_in_view(self, value):
