@@ -60,8 +60,8 @@ def grid_world(
         Figure: the figure drawn into.
 
     Raises:
-        ValueError: the arrays aren't of one shape ``[H, W]``, the start lies outside or in a wall, or a weight is outside
-            [0, 1].
+        ValueError: the arrays aren't of one shape ``[H, W]``, the start is outside or in a wall, or a weight is no
+            number in [0, 1].
 
     Examples:
         >>> walls, rewards = np.zeros((3, 3), bool), np.zeros((3, 3))
