@@ -5,14 +5,13 @@ that it works in a job without a display and in a notebook alike (but one figure
 shared by all threads while a figure is made). Needs matplotlib (``pip install torchrl-priors[recipes]``).
 """
 
-from recipes.plots.grid import draw_world, grid_world
+from recipes.plots.grid import grid_world
 from recipes.plots.panels import curve_panels, interval_panels, profile_panels
 from recipes.plots.style import method_color, method_label, prior_label, save_figure
 from recipes.plots.weights import episode_weights, weight_curves, weight_maps
 
 __all__ = [
     "curve_panels",
-    "draw_world",
     "episode_weights",
     "grid_world",
     "interval_panels",

@@ -14,9 +14,8 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch, Rectangle
 
 from recipes.plots.style import COLUMN_WIDTH, new_figure, paper_style
-from torchrl_priors.envs import GridWorlds
 
-__all__ = ["draw_world", "grid_world"]
+__all__ = ["grid_world"]
 
 _START, _WALL, _TERMINAL, _EMPTY, _DEGRADED, _LINES = "#4C84C4", "#111111", "#5FB56A", "#FFFFFF", "#C8102E", "#D4D4D4"
 _INK = "#111111"
@@ -103,27 +102,6 @@ def grid_world(
         ax.add_patch(_outline(r, c, _DEGRADED, cell, hatch="////"))
     _draw_numbers(ax, np.where(walls, 0.0, rewards), colors, cell)
     return figure
-
-
-def draw_world(worlds: GridWorlds, index: int = 0, **overlays: Any) -> Figure:
-    """One world of a batch as :func:`grid_world` draws it.
-
-    Args:
-        worlds (GridWorlds): the batch.
-        index (int): which of them.
-        overlays: ``prior_weight`` and ``degraded``, of each cell, ``[C]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_priors.envs import sample_worlds
-        >>> worlds = sample_worlds(torch.arange(2), size=7, window=3)
-        >>> len(draw_world(worlds, 1, prior_weight=torch.full((49,), 0.5)).axes)  # the map and the scale
-        2
-    """
-    size, world = worlds.size, worlds[index].cpu()
-    layers = {"walls": world.kind == 1, "rewards": world.reward, "terminal": world.terminal, **overlays}
-    squares = {name: np.asarray(layer).reshape(size, size) for name, layer in layers.items()}
-    return grid_world(**squares, start=divmod(int(world.start), size))
 
 
 def _check(walls: Any, start: tuple[int, int], **layers: Any) -> None:

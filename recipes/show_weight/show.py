@@ -107,12 +107,7 @@ def _maps(cfg: ShowConfig, study: Any, folder: Path, out: Path) -> list[Path]:
         weight = square(np.where(visits[point - 1] > 0, weights[point - 1], np.nan)[state])
         maps[f"After {point * study.evaluation.interval:,} transitions"] = np.where(blank, np.nan, weight)
     figure = plots.weight_maps(
-        {
-            "walls": square(world.kind == 1),
-            "rewards": square(world.reward),
-            "terminal": square(world.terminal),
-            "start": divmod(int(world.start), world.size),
-        },
+        taught.grid.layers(),
         maps,
         square(bad[state]),
         steps=np.arange(1, last + 1) * study.evaluation.interval,

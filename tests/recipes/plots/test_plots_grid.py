@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from test_plots import world
 
-from recipes.plots import draw_world, grid_world
-from torchrl_priors.envs import sample_worlds
+from recipes.plots import grid_world
 
 
 class TestGridWorld:
@@ -71,24 +69,3 @@ class TestGridWorld:
     def test_maps_that_do_not_fit_are_refused(self, change, message):
         with pytest.raises(ValueError, match=message):
             grid_world(**{**world(), **change})
-
-
-def pixels(figure: Figure) -> np.ndarray:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())
-
-
-class TestDrawWorld:
-    worlds = sample_worlds(torch.arange(2), size=7, window=3, object_prob=0.03)
-
-    def test_the_world_that_was_asked_for_is_drawn(self):
-        first, second = pixels(draw_world(self.worlds)), pixels(draw_world(self.worlds, 1))
-        assert np.array_equal(pixels(draw_world(self.worlds, 0)), first)
-        assert not np.array_equal(first, second)
-
-    @pytest.mark.parametrize(
-        "overlay", [{"prior_weight": torch.full((49,), 0.5)}, {"degraded": torch.ones(49, dtype=torch.bool)}]
-    )
-    def test_overlays_per_cell_are_drawn(self, overlay):
-        assert not np.array_equal(pixels(draw_world(self.worlds, **overlay)), pixels(draw_world(self.worlds)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from tensordict import TensorClass
@@ -62,6 +64,20 @@ class GridWorlds(TensorClass["nocast"]):  # type: ignore[name-defined]
     def has_goal(self) -> Tensor:
         """Bool ``[W]``: whether a positive terminal reward can be reached from the start."""
         return (self.reachable() & self.terminal & (self.reward > 0)).any(-1)
+
+    def layers(self, index: int = 0) -> dict[str, Any]:
+        """Walls, rewards, terminal cells and start of a world, as :func:`recipes.plots.grid_world` takes them.
+
+        Examples:
+            >>> from recipes.plots import grid_world
+            >>> worlds = sample_worlds(torch.arange(2), size=7, window=3)
+            >>> grid_world(**worlds.layers(1)).axes[0].get_ylim() == (7, 0)
+            True
+        """
+        world, shape = self[index].cpu(), (self.size, self.size)
+        cells = {"walls": world.kind == _WALL, "rewards": world.reward, "terminal": world.terminal}
+        squares = {name: values.view(shape).numpy() for name, values in cells.items()}
+        return {**squares, "start": divmod(int(world.start), self.size)}
 
     @classmethod
     def from_kinds(cls, kind: Tensor, start: Tensor, window: int) -> GridWorlds:

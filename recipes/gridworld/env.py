@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_priors.envs.worlds import KINDS, GridWorlds, windows
+from recipes.gridworld.worlds import KINDS, GridWorlds, windows
 
 __all__ = ["GridMaps", "GridWorldEnv", "transition"]
 
@@ -95,7 +95,7 @@ class GridWorldEnv(EnvBase):
         ValueError: probabilities outside [0, 1].
 
     Examples:
-        >>> from torchrl_priors.envs import sample_worlds
+        >>> from recipes.gridworld.worlds import sample_worlds
         >>> env = GridWorldEnv(sample_worlds(torch.arange(3)), seed=0)
         >>> rollout = env.rollout(5, break_when_any_done=False)
         >>> rollout.shape, rollout["observation"].shape

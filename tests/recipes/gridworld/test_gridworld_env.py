@@ -6,9 +6,8 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
 
-from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
-from torchrl_priors.envs.gridworld import transition
-from torchrl_priors.envs.worlds import windows
+from recipes.gridworld.env import GridWorldEnv, transition
+from recipes.gridworld.worlds import GridWorlds, sample_worlds, windows
 
 UP, RIGHT, DOWN, LEFT = range(4)
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]

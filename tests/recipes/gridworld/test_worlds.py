@@ -5,7 +5,7 @@ from collections import deque
 import pytest
 import torch
 
-from torchrl_priors.envs.worlds import KINDS, MOVES, GridWorlds, sample_worlds, windows
+from recipes.gridworld.worlds import KINDS, MOVES, GridWorlds, sample_worlds, windows
 
 
 def sequential_probabilities(wall_prob: float, object_prob: float) -> list[float]:
@@ -160,3 +160,14 @@ def test_bad_settings_are_refused_by_name(kwargs, message):
 def test_seeds_must_be_a_vector(seeds):
     with pytest.raises(ValueError, match="seeds"):
         sample_worlds(seeds)
+
+
+def test_the_layers_are_those_of_the_world_that_was_asked_for() -> None:
+    worlds = sample_worlds(torch.arange(2), size=7, window=3, object_prob=0.03)
+    for index in range(2):
+        layers, world = worlds.layers(index), worlds[index]
+        row, column = layers["start"]
+        assert row * 7 + column == world.start
+        assert layers["walls"].flatten().tolist() == (world.kind == 1).tolist()
+        assert layers["rewards"].flatten().tolist() == world.reward.tolist()
+        assert layers["terminal"].flatten().tolist() == world.terminal.tolist()
