@@ -59,7 +59,7 @@ def test_two_windows_with_enough_episodes_are_needed() -> None:
     assert reached(*[around(50)] * 3, min_episodes=11) == [False, False, False]
 
 
-def test_a_saved_state_continues() -> None:
+def test_a_plateau_continues_from_a_saved_state() -> None:
     first, second = Plateau(window=WINDOW), Plateau(window=WINDOW)
     for mean in (10, 20, 30):
         first.update(batch(around(mean)))
@@ -71,7 +71,7 @@ def test_a_saved_state_continues() -> None:
     assert second.reached
 
 
-def test_bad_input_is_named() -> None:
+def test_bad_input_of_a_plateau_is_named() -> None:
     for name, value in (("window", 0), ("min_episodes", 1), ("gain", -1)):
         with pytest.raises(ValueError, match=f"{name} must be at least"):
             Plateau(**{"window": 10, name: value})
