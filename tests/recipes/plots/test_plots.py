@@ -165,7 +165,7 @@ class TestNames:
         ("name", "label"),
         [("structural_1", "Structural, 1 state"), ("random_x", "random_x"), ("bad_teacher", "bad_teacher"), ("", "")],
     )
-    def test_prior_label(self, name, label):
+    def test_a_prior_is_labelled_by_its_kind_and_amount(self, name, label):
         assert prior_label(name) == label
 
 

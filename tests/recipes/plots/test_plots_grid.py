@@ -43,7 +43,7 @@ class TestGridWorld:
         brightness = image[3].mean(-1)
         assert brightness[4] == 1 > brightness[0] > brightness[1] > brightness[2]
 
-    def test_draws_into_given_axes(self):
+    def test_a_grid_world_is_drawn_into_given_axes(self):
         figure = Figure()
         first, second = figure.subplots(1, 2)
         assert grid_world(**world(), ax=second) is figure
