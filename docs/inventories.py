@@ -20,8 +20,9 @@ ROLE = re.compile(r"(?::py)?[:{](?:class|func|meth|attr|data|mod|exc)[:}]`~?([\w
 
 
 def names_used() -> set[str]:
-    """Every name in a role, in the package's docstrings and in the pages."""
-    files = [*(DOCS.parent / "torchrl_priors").rglob("*.py"), *DOCS.rglob("*.md"), *DOCS.rglob("*.rst")]
+    """Every name in a role, in the docstrings and in the pages."""
+    code = [file for folder in ("torchrl_priors", "recipes") for file in (DOCS.parent / folder).rglob("*.py")]
+    files = [*code, *DOCS.rglob("*.md"), *DOCS.rglob("*.rst")]
     names = {name for file in files for name in ROLE.findall(file.read_text(encoding="utf-8"))}
     return {ALIASES.get(name, name) for name in names}
 

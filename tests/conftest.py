@@ -53,7 +53,7 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
     For what else a recipe does. That its figures can be drawn is seen where a study or a report is looked at whole.
     """
-    style = pytest.importorskip("torchrl_priors.plots.style")
+    style = pytest.importorskip("recipes.plots.style")
     monkeypatch.setattr(style, "_pictures", lambda figure, formats, dpi: [b"not drawn"] * len(formats))
 
 

@@ -73,7 +73,7 @@ def test_names_stand_beside_torchrls_own(folder: Path) -> None:
     assert isinstance(instantiate(config.theirs), RewardSum)
 
 
-def test_leaves_of_python_and_settings_of_yaml_make_a_loss(folder: Path) -> None:
+def test_a_loss_is_made_of_python_objects_and_settings_of_yaml(folder: Path) -> None:
     loss = instantiate(composed(folder).loss, actor_network=make_actor())
     assert isinstance(loss, AE2RLoss)
     assert loss.spec.bonus == "next"
@@ -100,7 +100,7 @@ def test_objects_of_python_are_shared_with_a_transform_of_yaml(folder: Path) -> 
     assert bonus.__dict__["prior_weight"] is weight
 
 
-def test_a_typo_is_an_error(folder: Path) -> None:
+def test_a_typo_in_an_override_is_an_error(folder: Path) -> None:
     with pytest.raises(ConfigCompositionException, match="bonus_coef"):
         composed(folder, "bonus.bonus_coef=1")
 

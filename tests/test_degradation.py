@@ -63,14 +63,14 @@ class TestStructuralDegradation:
         assert_advice(StructuralDegradation(prior, degraded), prior, prior.adversary(), batch, mask)
         assert set(batch.keys(True, True)) == keys
 
-    def test_mask_of_each_world(self) -> None:
+    def test_each_world_has_a_mask_of_its_own(self) -> None:
         prior = BoltzmannPrior(torch.randn(2, STATES, ACTIONS))
         table = torch.rand(2, STATES) < 0.5
         batch = visits(2, 9)
         mask = torch.stack([table[world, batch["state"][world]] for world in range(2)])
         assert_advice(StructuralDegradation(prior, table), prior, prior.adversary(), batch, mask)
 
-    def test_continuous_advice(self) -> None:
+    def test_degraded_continuous_advice_has_the_negated_mean(self) -> None:
         batch = TensorDict(
             loc0=torch.randn(4, 2),
             scale0=torch.rand(4, 2) + 0.1,
@@ -82,7 +82,7 @@ class TestStructuralDegradation:
         torch.testing.assert_close(dist.base_dist.loc, sign * batch["loc0"])
         torch.testing.assert_close(dist.base_dist.scale, batch["scale0"])
 
-    def test_scalar_parameters(self) -> None:
+    def test_scalar_parameters_are_degraded(self) -> None:
         module = ProbabilisticTensorDictModule(
             {"loc": "loc0", "scale": "scale0"}, ["action"], distribution_class=d.Normal
         )
@@ -91,7 +91,7 @@ class TestStructuralDegradation:
         )
         assert StructuralDegradation(ActionPrior(module), "bad").get_dist(batch).loc.tolist() == [-1.0, 1.0]
 
-    def test_another_adversary(self, prior: BoltzmannPrior) -> None:
+    def test_bad_advice_is_that_of_another_adversary(self, prior: BoltzmannPrior) -> None:
         batch = visits(30)
         adversary = UniformPrior(ACTIONS)
         mixed = StructuralDegradation(prior, self.MASK, adversary)
@@ -102,7 +102,7 @@ class TestStructuralDegradation:
         mixed = StructuralDegradation(prior, self.MASK)
         assert_advice(mixed.adversary(), prior, prior.adversary(), batch, ~self.MASK[batch["state"]])
 
-    def test_reads_what_it_needs(self, prior: BoltzmannPrior) -> None:
+    def test_a_structural_degradation_reads_what_its_mask_needs(self, prior: BoltzmannPrior) -> None:
         assert StructuralDegradation(prior, self.MASK).in_keys == ["state"]
         assert StructuralDegradation(prior, self.MASK, state_key="cell").in_keys == ["state", "cell"]
         assert StructuralDegradation(prior, "mask").in_keys == ["state", "mask"]
@@ -139,11 +139,11 @@ class TestRandomDegradation:
         torch.testing.assert_close(batch["prior", "logits"].log_softmax(-1), mixed.get_dist(batch).logits)
 
     @pytest.mark.parametrize("p", [0.0, 1.0])
-    def test_extreme_probabilities(self, prior: BoltzmannPrior, p: float) -> None:
+    def test_advice_is_never_bad_at_0_and_always_at_1(self, prior: BoltzmannPrior, p: float) -> None:
         batch = visits(50)
         assert_advice(RandomDegradation(prior, p), prior, prior.adversary(), batch, torch.tensor(bool(p)))
 
-    def test_frequency_is_p(self, prior: BoltzmannPrior) -> None:
+    def test_bad_advice_comes_with_frequency_p(self, prior: BoltzmannPrior) -> None:
         batch = visits(20_000)
         RandomDegradation(prior, 0.15, seed=1).draw(batch)
         assert abs(batch["prior", "degraded"].float().mean() - 0.15) < 0.01  # 4 standard deviations
@@ -192,7 +192,7 @@ class TestRandomDegradation:
         with pytest.raises(ValueError, match="draw_key"):
             RandomDegradation(RandomDegradation(prior, 0.5), 0.5)
 
-    def test_random_in_structural(self, prior: BoltzmannPrior) -> None:
+    def test_a_random_degradation_can_be_degraded_structurally(self, prior: BoltzmannPrior) -> None:
         mixed = StructuralDegradation(RandomDegradation(prior, 0.5), torch.ones(STATES, dtype=torch.bool))
         assert mixed.draw_keys == [("prior", "degraded")]
         batch = visits(50)

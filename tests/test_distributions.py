@@ -186,7 +186,7 @@ def test_different_actions_are_refused(dist, prior_dist):
         cross_entropy(dist, prior_dist)
 
 
-def test_no_samples_are_refused():
+def test_a_cross_entropy_of_no_samples_is_refused():
     dist = d.Categorical(torch.ones(2))
     with pytest.raises(ValueError, match="num_samples"):
         cross_entropy(dist, dist, num_samples=0)

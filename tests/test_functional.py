@@ -39,7 +39,7 @@ logits = floats(-20, 20, 4)
 
 
 class TestCategorical:
-    def test_cross_entropy_by_hand(self) -> None:
+    def test_cross_entropy_of_categoricals_is_that_worked_out_by_hand(self) -> None:
         student, prior = vector(0.5, 0.5).log(), vector(0.25, 0.75).log()
         torch.testing.assert_close(
             categorical_cross_entropy(student, prior), torch.tensor(0.5 * math.log(16 / 3)).double()
@@ -77,7 +77,7 @@ class TestCategorical:
 
 
 class TestGaussian:
-    def test_cross_entropy_by_hand(self) -> None:
+    def test_cross_entropy_of_gaussians_is_that_worked_out_by_hand(self) -> None:
         # dimension 0: (2^2 + 1^2) / 2 + log 1; dimension 1: (1 + 3^2) / (2 * 4) + log 2; each + log(2 pi) / 2
         result = gaussian_cross_entropy(vector(1.0, 3.0), vector(2.0, 1.0), vector(0.0, 0.0), vector(1.0, 2.0))
         torch.testing.assert_close(result, torch.tensor(2.5 + 1.25 + math.log(2) + math.log(2 * math.pi)).double())
@@ -203,7 +203,7 @@ class TestBonus:
 
 
 class TestTdResidual:
-    def test_two_steps_by_hand(self) -> None:
+    def test_td_residual_is_that_worked_out_by_hand(self) -> None:
         value, next_value = vector(1, 2), vector(2, 50)
         result = td_residual(value, vector(3, 5), next_value, torch.tensor([NO, YES]), 0.5, bonus=vector(-1, -0.5))
         assert result.tolist() == [3 - 1 + 0.5 * 2 - 1, 5 - 0.5 - 2]
@@ -237,7 +237,7 @@ class TestPriorWeightLoss:
         assert loss.item() == (-1 + 0.5 * 4) ** 2
         assert gradient.item() == -2 * -4 * (-1 + 0.5 * 4)
 
-    def test_it_is_the_squared_residual_of_the_shaped_return(self) -> None:
+    def test_loss_of_the_weight_is_the_squared_residual_of_the_shaped_return(self) -> None:
         # The paper's form, [V - R - gamma V' - B(w)]^2, is that of td_residual with the bonus in it.
         value, reward, next_value, signal = torch.randn(4, 10)
         weight, end = torch.rand(10), torch.rand(10) < 0.3
@@ -246,7 +246,7 @@ class TestPriorWeightLoss:
         torch.testing.assert_close(prior_weight_loss(target, weight, signal), with_bonus.square())
 
     @given(st.floats(-5, 5), st.floats(-5, 5).filter(lambda x: abs(x) > 0.1))
-    def test_its_minimiser_is_target_over_signal(self, target: float, signal: float) -> None:
+    def test_minimiser_of_the_weights_loss_is_target_over_signal(self, target: float, signal: float) -> None:
         best = target / signal
         low, least, high = (
             prior_weight_loss(vector(target), vector(w), vector(signal)).item() for w in (best - 0.1, best, best + 0.1)

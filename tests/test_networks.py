@@ -39,7 +39,7 @@ def make(request: pytest.FixtureRequest) -> Any:
 
 
 class TestMakeActor:
-    def test_writes_what_a_collector_and_ppo_expect(self) -> None:
+    def test_an_actor_writes_what_a_collector_and_ppo_expect(self) -> None:
         batch = make_actor(OBS, ACTIONS)(observations(2, 4))
         assert set(batch.keys()) == {"observation_norm", "loc", "scale", "action", "action_log_prob"}
         assert batch["action"].shape == batch["loc"].shape == batch["scale"].shape == (2, 4, ACTIONS)
@@ -70,7 +70,7 @@ class TestMakeActor:
         batch["scale"].sum().backward()
         assert (net.scale.state_independent_scale.grad != 0).all()
 
-    def test_reads_a_nested_key(self) -> None:
+    def test_an_actor_reads_a_nested_key(self) -> None:
         key = ("agent", "observation")
         assert make_actor(OBS, ACTIONS, in_key=key)(observations(4, key=key))["action"].shape == (4, ACTIONS)
 
@@ -82,7 +82,7 @@ class TestMakeActor:
         torch.testing.assert_close(cross_entropy(student, teacher), kl + entropy)
 
     @pytest.mark.parametrize("functional", [False, True])
-    def test_trains_in_ppo(self, functional: bool) -> None:
+    def test_an_actor_trains_in_ppo(self, functional: bool) -> None:
         actor, critic = make_actor(OBS, ACTIONS), make_critic(OBS)
         loss = ClipPPOLoss(actor, critic, functional=functional, entropy_coeff=0.0)
         with torch.no_grad():
@@ -96,7 +96,7 @@ class TestMakeActor:
 
 
 class TestMakeCritic:
-    def test_writes_one_value_a_state(self) -> None:
+    def test_a_critic_writes_one_value_a_state(self) -> None:
         assert make_critic(OBS)(observations(2, 4))["state_value"].shape == (2, 4, 1)
 
     def test_several_critics_write_their_own_keys(self) -> None:
@@ -113,13 +113,13 @@ class TestMakePriorWeight:
         expected = torch.full_like(weight, init_bias).sigmoid()
         torch.testing.assert_close(weight, expected, atol=0.02, rtol=0)
 
-    def test_has_the_architecture_of_the_critic(self) -> None:
+    def test_a_prior_weight_has_the_architecture_of_the_critic(self) -> None:
         shapes = [[parameter.shape for parameter in net.parameters()] for net in (make_critic(7), make_prior_weight(7))]
         assert shapes[0] == shapes[1]
 
 
 class TestEveryNetwork:
-    def test_has_orthogonal_weights_and_no_bias_at_first(self, make: Any) -> None:
+    def test_every_network_has_orthogonal_weights_and_no_bias_at_first(self, make: Any) -> None:
         layers = linears(make(hidden=(8, 8)))
         assert len(layers) == 3
         for layer in layers[:2]:
@@ -133,7 +133,9 @@ class TestEveryNetwork:
         torch.testing.assert_close(weight @ weight.T, gain**2 * torch.eye(len(weight)), atol=1e-6, rtol=1e-4)
 
     @pytest.mark.parametrize(("name", "activation"), sorted(ACTIVATIONS.items()))
-    def test_has_the_sizes_and_the_activation_it_was_given(self, make: Any, name: str, activation: type) -> None:
+    def test_every_network_has_the_sizes_and_the_activation_it_was_given(
+        self, make: Any, name: str, activation: type
+    ) -> None:
         net = make(hidden=(8, 4, 2), activation=name)
         assert [layer.out_features for layer in linears(net)][:3] == [8, 4, 2]
         assert sum(type(module) is activation for module in net.modules()) == 3

@@ -24,7 +24,7 @@ def observations(*batch: int, scale: float = 1.0) -> TensorDict:
 
 class TestNetwork:
     @pytest.mark.parametrize("batch", [(), (5,), (2, 7)])
-    def test_is_a_sigmoid_of_the_network(self, batch: tuple[int, ...]) -> None:
+    def test_a_weight_is_a_sigmoid_of_the_network(self, batch: tuple[int, ...]) -> None:
         net = network()
         td = PriorWeight(net)(observations(*batch))
         assert td["prior_weight"].shape == (*batch, 1)
@@ -78,7 +78,7 @@ class TestNetwork:
             value = weight(observations(50))["prior_weight"]
         torch.testing.assert_close(value, torch.full_like(value, 0.2689), atol=5e-3, rtol=0)
 
-    def test_reset_inside_a_sequence(self) -> None:
+    def test_a_reset_inside_a_sequence_scales_the_last_layer(self) -> None:
         weight = PriorWeight(network(), init_bias=-1.0)
         old = [parameter.clone() for parameter in weight.parameters()]
         TensorDictSequential(weight).reset_parameters_recursive()
@@ -92,7 +92,7 @@ class TestNetwork:
         assert 0 < last.abs().max() <= 0.01 * 16**-0.5
         assert bias.item() == -1.0
 
-    def test_keys(self) -> None:
+    def test_the_weight_reads_and_writes_the_keys_it_was_given(self) -> None:
         net = nn.Bilinear(OBS, 2, 1)
         weight = PriorWeight(
             net, in_keys=["observation", ("agent", "memory")], out_keys=[("agent", "w")], init_scale=None
@@ -166,14 +166,14 @@ class TestTable:
         with pytest.raises(IndexError):
             weight(TensorDict(state=torch.full((*worlds, 3), state), batch_size=[*worlds, 3]))
 
-    def test_needs_a_state(self) -> None:
+    def test_a_table_needs_a_state(self) -> None:
         with pytest.raises(ValueError, match="at least one state"):
             PriorWeight.table(0)
 
 
 class TestConstant:
     @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])
-    def test_is_exact_and_not_learned(self, value: float) -> None:
+    def test_a_constant_weight_is_exact_and_not_learned(self, value: float) -> None:
         weight = PriorWeight.constant(value)
         td = weight(TensorDict(batch_size=[2, 5]))
         assert torch.equal(td["prior_weight"], torch.full((2, 5, 1), value))
@@ -185,7 +185,7 @@ class TestConstant:
         weight.load_state_dict(PriorWeight.constant(0.7).state_dict())
         assert weight(TensorDict(batch_size=[1]))["prior_weight"].item() == pytest.approx(0.7)
 
-    def test_reset_keeps_the_value(self) -> None:
+    def test_a_reset_keeps_a_constant_weight(self) -> None:
         weight = PriorWeight.constant(0.7)
         weight.reset_parameters_recursive()
         assert weight(TensorDict(batch_size=[1]))["prior_weight"].item() == pytest.approx(0.7)

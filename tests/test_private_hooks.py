@@ -62,7 +62,7 @@ def find(path: str) -> Any:
 
 
 @pytest.mark.parametrize(("owner", "name"), [(owner, name) for owner, names in OF_CLASSES.items() for name in names])
-def test_a_class_has_its_hook(owner: str, name: str) -> None:
+def test_every_class_of_torchrl_has_its_private_hook(owner: str, name: str) -> None:
     if owner == "torch" and not name.startswith("_foreach"):
         importlib.import_module(f"torch.{name}")
     assert hasattr(find(owner), name)

@@ -41,7 +41,7 @@ def test_schedules_go_through_points_worked_out_by_hand(schedule, frames, values
 
 
 @pytest.mark.parametrize("schedule", [LinearSchedule(0.1, 0.3, frames=7), CosineSchedule(0.1, 0.3, frames=7)])
-def test_start_and_end_are_exact(schedule):
+def test_schedules_start_and_end_exactly(schedule):
     assert schedule(0).item() == 0.1
     assert schedule(7).item() == 0.3
 

@@ -63,7 +63,7 @@ def test_settings_of_the_caller_win() -> None:
     assert prior_transforms(loss, boundary="zero")[0].boundary == "zero"
 
 
-def test_another_loss_is_refused() -> None:
+def test_prior_shaping_refuses_another_loss() -> None:
     with pytest.raises(TypeError, match=r"Expected an AE2RLoss, .* got Linear"):
         prior_transforms(nn.Linear(1, 1))
 

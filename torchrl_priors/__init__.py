@@ -2,14 +2,8 @@
 
 from torchrl_priors.artifacts import load_prior, load_sb3_prior, save_prior
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
-from torchrl_priors.objectives import (
-    AE2RLoss,
-    AVECMixin,
-    ClipPPOPriorLoss,
-    MultiTeacherLoss,
-    ValueOffset,
-)
-from torchrl_priors.plateau import Plateau
+from torchrl_priors.episode_returns import Plateau
+from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss, MultiTeacherLoss, ValueOffset
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import (
     ActionPrior,

@@ -26,11 +26,9 @@ from torchrl.trainers.algorithms.configs import ConfigBase, HookConfig, LossConf
 from torchrl_priors.artifacts import load_prior
 from torchrl_priors.objectives import AE2RLoss, ClipPPOPriorLoss
 from torchrl_priors.prior_weight import PriorWeight
-from torchrl_priors.priors import ActionPrior, BoltzmannPrior, Prior, UniformPrior
+from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
 from torchrl_priors.trainer_hook import PriorShaping
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
-
-__all__ = ["register"]
 
 # deprecated by TorchRL, or, as classes, nothing that YAML has (their defaults are the constructors')
 _SKIPPED = {"self", "actor", "critic", "advantage_key", "value_target_key", "value_key", "distribution_class"}
@@ -59,42 +57,23 @@ def _settings(settings: dict[str, Any]) -> dict[str, Any]:
     return {name: _plain(name, value) for name, value in settings.items()}
 
 
-def make_prior(cls: Callable[..., Prior], action_key: Any = None, **settings: Any) -> Prior:
-    """A prior, which finds the student's action under ``action_key``."""
-    prior = cls(**_settings(settings))
-    if action_key is not None:
-        prior.set_keys(action=nested_key(action_key))
-    return prior
+def _maker(cls: Callable[..., Any]) -> Callable[..., Any]:
+    """What builds an object of a class from YAML; a prior can be told its ``action_key`` too."""
+
+    def make(action_key: Any = None, **settings: Any) -> Any:
+        made = cls(**_settings(settings))
+        if action_key is not None:
+            made.set_keys(action=nested_key(action_key))
+        return made
+
+    return make
 
 
-def make_action_prior(**settings: Any) -> Prior:
-    """What ``prior: action`` builds."""
-    return make_prior(ActionPrior, **settings)
-
-
-def make_boltzmann_prior(**settings: Any) -> Prior:
-    """What ``prior: boltzmann`` builds."""
-    return make_prior(BoltzmannPrior, **settings)
-
-
-def make_uniform_prior(**settings: Any) -> Prior:
-    """What ``prior: uniform`` builds."""
-    return make_prior(UniformPrior, **settings)
-
-
-def make_artifact_prior(**settings: Any) -> Prior:
-    """What ``prior: artifact`` builds: a policy from a file."""
-    return make_prior(load_prior, **settings)
-
-
-def make_prior_weight(**settings: Any) -> PriorWeight:
-    """What ``model: prior_weight`` builds."""
-    return PriorWeight(**_settings(settings))
-
-
-def make_prior_log_prob(**settings: Any) -> PriorLogProb:
-    """What ``transform: prior_log_prob`` builds."""
-    return PriorLogProb(**_settings(settings))
+# What configs name as their targets.
+make_action_prior, make_artifact_prior = _maker(ActionPrior), _maker(load_prior)
+make_boltzmann_prior, make_uniform_prior = _maker(BoltzmannPrior), _maker(UniformPrior)
+make_prior_weight, make_prior_log_prob = _maker(PriorWeight), _maker(PriorLogProb)
+make_prior_shaping = _maker(PriorShaping)
 
 
 def make_prior_bonus(method: str | None = None, **settings: Any) -> PriorBonus:
@@ -130,14 +109,7 @@ def make_clip_ppo_prior_loss(
     return loss
 
 
-def make_prior_shaping(**settings: Any) -> PriorShaping:
-    """What ``hook: prior_shaping`` builds."""
-    return PriorShaping(**_settings(settings))
-
-
-def _config(
-    make: Callable[..., Any], base: type, *sources: Callable[..., Any], without: tuple[str, ...] = (), **more: Any
-) -> type:
+def _config(make: str, base: type, *sources: Callable[..., Any], without: tuple[str, ...] = (), **more: Any) -> type:
     """A config with the parameters of ``sources`` as fields, the later ones winning."""
     parameters: dict[str, Any] = {}
     skipped = _SKIPPED - {"actor"} if base is TransformConfig else _SKIPPED  # the transforms' actor is not deprecated
@@ -148,9 +120,9 @@ def _config(
                 parameters[name] = MISSING if parameter.default is parameter.empty else parameter.default
     for name in without:
         del parameters[name]
-    fields = {**parameters, **more, "_target_": f"{__name__}.{make.__name__}", "_partial_": False}
+    fields = {**parameters, **more, "_target_": f"{__name__}.make_{make}", "_partial_": False}
     return make_dataclass(
-        make.__name__.removeprefix("make_").title().replace("_", "") + "Config",
+        make.title().replace("_", "") + "Config",
         [(name, Any, field(default=value)) for name, value in fields.items()],
         bases=(base,),
         namespace={"__post_init__": lambda self: None, "__module__": __name__},
@@ -162,15 +134,15 @@ def register() -> None:
     store = ConfigStore.instance().store
     ppo, of_prior = (PPOLoss, ClipPPOLoss, ClipPPOPriorLoss), ("functional", "gamma")
     for group, name, node in (
-        ("prior", "action", _config(make_action_prior, ConfigBase, ActionPrior, action_key=None)),
-        ("prior", "artifact", _config(make_artifact_prior, ConfigBase, load_prior, action_key=None)),
-        ("prior", "boltzmann", _config(make_boltzmann_prior, ConfigBase, BoltzmannPrior, action_key=None)),
-        ("prior", "uniform", _config(make_uniform_prior, ConfigBase, UniformPrior, action_key=None)),
-        ("model", "prior_weight", _config(make_prior_weight, ConfigBase, PriorWeight)),
-        ("transform", "prior_log_prob", _config(make_prior_log_prob, TransformConfig, PriorLogProb)),
-        ("transform", "prior_bonus", _config(make_prior_bonus, TransformConfig, PriorBonus, method=None)),
-        ("loss", "ae2r", _config(make_ae2r_loss, LossConfig, AE2RLoss, keys=None)),
-        ("loss", "clip_ppo_prior", _config(make_clip_ppo_prior_loss, LossConfig, *ppo, without=of_prior, keys=None)),
-        ("hook", "prior_shaping", _config(make_prior_shaping, HookConfig, PriorShaping)),
+        ("prior", "action", _config("action_prior", ConfigBase, ActionPrior, action_key=None)),
+        ("prior", "artifact", _config("artifact_prior", ConfigBase, load_prior, action_key=None)),
+        ("prior", "boltzmann", _config("boltzmann_prior", ConfigBase, BoltzmannPrior, action_key=None)),
+        ("prior", "uniform", _config("uniform_prior", ConfigBase, UniformPrior, action_key=None)),
+        ("model", "prior_weight", _config("prior_weight", ConfigBase, PriorWeight)),
+        ("transform", "prior_log_prob", _config("prior_log_prob", TransformConfig, PriorLogProb)),
+        ("transform", "prior_bonus", _config("prior_bonus", TransformConfig, PriorBonus, method=None)),
+        ("loss", "ae2r", _config("ae2r_loss", LossConfig, AE2RLoss, keys=None)),
+        ("loss", "clip_ppo_prior", _config("clip_ppo_prior_loss", LossConfig, *ppo, without=of_prior, keys=None)),
+        ("hook", "prior_shaping", _config("prior_shaping", HookConfig, PriorShaping)),
     ):
         store(group=group, name=name, node=node, provider="torchrl_priors")

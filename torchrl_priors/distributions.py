@@ -175,12 +175,8 @@ def _closed_form(dist: d.Distribution, prior_dist: d.Distribution) -> Tensor | N
         loc, scale = prior_base.loc.unsqueeze(-2), prior_base.scale.unsqueeze(-2)
         return (dist.mixture_distribution.probs * gaussian_cross_entropy(base.loc, base.scale, loc, scale)).sum(-1)
     if isinstance(dist, d.Normal) and isinstance(prior_dist, d.Normal):
-        return gaussian_cross_entropy(
-            dist.loc.unsqueeze(-1),
-            dist.scale.unsqueeze(-1),
-            prior_dist.loc.unsqueeze(-1),
-            prior_dist.scale.unsqueeze(-1),
-        )
+        params = (dist.loc, dist.scale, prior_dist.loc, prior_dist.scale)
+        return gaussian_cross_entropy(*(value.unsqueeze(-1) for value in params))
     if has_analytic_kl(dist, prior_dist) and has_analytic_entropy(dist):
         return _kl(dist, prior_dist) + dist.entropy()
     return None
@@ -255,11 +251,9 @@ def bounds_of(dist: Any) -> tuple[Any, Any] | None:
         return -torch.inf, torch.inf
     while hasattr(support, "base_constraint"):
         support = support.base_constraint
-    return (
-        None
-        if support.is_discrete
-        else (getattr(support, "lower_bound", -torch.inf), getattr(support, "upper_bound", torch.inf))
-    )
+    if support.is_discrete:
+        return None
+    return getattr(support, "lower_bound", -torch.inf), getattr(support, "upper_bound", torch.inf)
 
 
 def _check(

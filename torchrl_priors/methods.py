@@ -57,13 +57,7 @@ METHODS: dict[str, MethodSpec] = {
     # beyond the paper
     "kickstart": MethodSpec("none", auxiliary=True, adaptive=False, label="Kickstart", color="#CC79A7"),
     "pull": MethodSpec(
-        "none",
-        auxiliary=True,
-        adaptive=False,
-        cross_entropy="teacher",
-        aux_coeff=0.3,
-        label="Pull",
-        color="#332288",
+        "none", auxiliary=True, adaptive=False, cross_entropy="teacher", aux_coeff=0.3, label="Pull", color="#332288"
     ),
     "aligned": MethodSpec(
         "none",

@@ -30,7 +30,23 @@ class Schedule(ABC):
 
 
 @dataclass(frozen=True)
-class LinearSchedule(Schedule):
+class _StartToEnd(Schedule):
+    """From ``start`` to ``end`` in so many ``frames``, then constant."""
+
+    start: float
+    end: float
+    frames: float
+
+    def __post_init__(self) -> None:
+        _check(self, self.frames, [self.start, self.end])
+
+    def _part(self, frames: Tensor) -> Tensor:
+        """How far the way is done, in [0, 1]."""
+        return (frames / self.frames).clamp(0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class LinearSchedule(_StartToEnd):
     r"""From ``start`` to ``end`` in a straight line, then constant.
 
     .. math::
@@ -50,34 +66,20 @@ class LinearSchedule(Schedule):
         [1.0, 0.75, 0.0, 0.0]
     """
 
-    start: float
-    end: float
-    frames: float
-
-    def __post_init__(self) -> None:
-        _check(self, self.frames, [self.start, self.end])
-
     def _value(self, frames: Tensor) -> Tensor:
-        part = (frames / self.frames).clamp(0.0, 1.0)
+        part = self._part(frames)
         return self.start * (1 - part) + self.end * part
 
 
 @dataclass(frozen=True)
-class CosineSchedule(Schedule):
+class CosineSchedule(_StartToEnd):
     r"""From ``start`` to ``end`` along half a period of a cosine, slowly at both ends, then constant.
 
     .. math::
         c(n) = c_1 + (c_0 - c_1)\,\tfrac12(1 + \cos \pi p),\quad p = \min(n / N, 1)
 
-    After Loshchilov & Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", without restarts.
-
-    Args:
-        start (float): :math:`c_0`.
-        end (float): :math:`c_1`.
-        frames (float): :math:`N`, when the end is reached.
-
-    Raises:
-        ValueError: ``frames`` is not positive, or a value is not finite.
+    After Loshchilov & Hutter, "SGDR: Stochastic Gradient Descent with Warm Restarts", without restarts. Its arguments
+    and errors are those of :class:`LinearSchedule`.
 
     Examples:
         >>> anneal = CosineSchedule(1.0, 0.0, frames=900)
@@ -85,15 +87,8 @@ class CosineSchedule(Schedule):
         [1.0, 0.75, 0.25, 0.0, 0.0]
     """
 
-    start: float
-    end: float
-    frames: float
-
-    def __post_init__(self) -> None:
-        _check(self, self.frames, [self.start, self.end])
-
     def _value(self, frames: Tensor) -> Tensor:
-        part = (1 + torch.cos(math.pi * (frames / self.frames).clamp(0.0, 1.0))) / 2
+        part = (1 + torch.cos(math.pi * self._part(frames))) / 2
         return self.start * part + self.end * (1 - part)
 
 

@@ -1,4 +1,4 @@
-"""Tables of values per integer state, as TensorDict modules."""
+"""Values by state, as TensorDict modules: a table, or the same in every state."""
 
 from __future__ import annotations
 
@@ -9,23 +9,15 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
-__all__ = ["StateTable", "by_state"]
-
 
 def by_state(
     values: Tensor | nn.Module | TensorDictModuleBase | Callable[..., Tensor],
     in_keys: Sequence[NestedKey] | None,
     out_key: NestedKey,
 ) -> TensorDictModuleBase:
-    """Values ``[*B, K]`` of each state as a TensorDict module.
+    """Values ``[*B, K]`` of each state as a TensorDict module, of a table ``[S, K]`` or ``[*W, S, K]`` or a network.
 
-    Args:
-        values: a table ``[S, K]`` or ``[*W, S, K]``; a network or function of tensors; or such a module, as it is.
-        in_keys (sequence of NestedKey, optional): of a table ``["state"]``, else ``["observation"]``, if not given.
-        out_key (NestedKey): where a table, a network or a function writes.
-
-    Raises:
-        ValueError: a table that reads several keys.
+    If ``in_keys`` are not given, a table reads ``"state"``, a network or function ``"observation"``.
     """
     if isinstance(values, TensorDictModuleBase):
         return values
@@ -38,12 +30,7 @@ def by_state(
 
 
 def _read_state(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """The integer states of a tensordict, ``[*B]``, whether they are stored as ``[*B]`` or ``[*B, 1]``.
-
-    Raises:
-        KeyError: the key is missing.
-        ValueError: the entry is not of an integer dtype.
-    """
+    """The integer states of a tensordict, ``[*B]``, whether they are stored as ``[*B]`` or ``[*B, 1]``."""
     state = tensordict.get(key, None)
     if state is None:
         raise KeyError(
@@ -134,3 +121,21 @@ class StateTable(TensorDictModuleBase):
         else:
             state = torch.where(state < 0, num_states, state)  # -1 is an error too, not the last state
         return flat[state]
+
+
+class Constant(TensorDictModuleBase):
+    """Writes the same values at every step, under their names."""
+
+    def __init__(self, values: dict[str, Tensor]) -> None:
+        super().__init__()
+        self.in_keys: list[NestedKey] = []
+        self.out_keys = list(values)
+        for name, value in values.items():
+            self.register_buffer(name, value)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes them."""
+        for name in self.out_keys:
+            value = getattr(self, name)
+            tensordict.set(name, value.to(tensordict.device).expand(*tensordict.batch_size, *value.shape))
+        return tensordict

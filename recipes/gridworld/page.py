@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from recipes.common.run_folder import write_file
-from recipes.report.markdown import interval, pivot, plus_minus, table
-from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import (
+from recipes.metrics import ConfidenceInterval
+from recipes.plots import (
     curve_panels,
     interval_panels,
     method_label,
@@ -22,6 +21,7 @@ from torchrl_priors.plots import (
     profile_panels,
     save_figure,
 )
+from recipes.report.markdown import interval, pivot, plus_minus, table
 
 __all__ = ["summary", "write"]
 

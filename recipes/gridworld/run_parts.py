@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchrl_priors.envs import GridWorlds
+from recipes.gridworld.worlds import GridWorlds
 from torchrl_priors.methods import get_method
 
 __all__ = [
@@ -41,7 +41,7 @@ def generator(seed: int, *names: str) -> np.random.Generator:
 
 
 class World(NamedTuple):
-    """One of the library's :class:`~torchrl_priors.envs.GridWorlds` as arrays, and how it behaves.
+    """One of :class:`~recipes.gridworld.worlds.GridWorlds` as arrays, and how it behaves.
 
     Attributes:
         next_cell: int64 ``[C, 4]``.

@@ -13,14 +13,14 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
+from recipes import plots
 from recipes.common.progress import progress_bar
 from recipes.common.run_folder import RunFolder, digest
 from recipes.common.schedules import applies, make_schedule, without_idle
 from recipes.gridworld import page, run_parts, tabular
 from recipes.gridworld.config import GridworldConfig
 from recipes.gridworld.tables import Episodes, prior_weight_curves, tables_of
-from torchrl_priors import plots
-from torchrl_priors.envs import GridWorldEnv, GridWorlds, sample_worlds
+from recipes.gridworld.worlds import GridWorlds, sample_worlds
 
 #: What the results do not depend on.
 _INCIDENTAL = ("out", "workers", "block_worlds")
@@ -182,7 +182,7 @@ def report(cfg: GridworldConfig, folder: RunFolder, results: dict[str, np.ndarra
     written = [
         folder.write(f"{name}.csv", table.to_csv(index=False, float_format="%.6g")) for name, table in tables.items()
     ]
-    pictures = {"world": GridWorldEnv(sample_world(cfg, cfg.seed)).render()}
+    pictures = {"world": plots.grid_world(**sample_world(cfg, cfg.seed).layers())}
     if by_state := prior_weight_curves(cfg, data):
         steps = np.arange(1, cfg.evaluation.points + 1) * cfg.evaluation.interval
         pictures["prior_weights"] = plots.weight_curves(by_state, steps)

@@ -10,14 +10,14 @@ import pandas as pd
 from recipes.gridworld.config import GridworldConfig
 from recipes.gridworld.run_parts import runs_of
 from recipes.gridworld.tabular import LOG_FIELDS
-from torchrl_priors.methods import get_method
-from torchrl_priors.metrics import (
+from recipes.metrics import (
     area_ratio,
     area_under_curve,
     iqm,
     mean_confidence_interval,
     stratified_bootstrap_ci,
 )
+from torchrl_priors.methods import get_method
 
 __all__ = ["Episodes", "tables_of"]
 

@@ -28,9 +28,9 @@ from torchrl_priors import (
     ValueOffset,
 )
 from torchrl_priors.collectors import RunningNorm, VectorCollector
+from torchrl_priors.episode_returns import Plateau
 from torchrl_priors.networks import make_actor, make_critic, make_prior_weight
 from torchrl_priors.objectives import CompiledStep
-from torchrl_priors.plateau import Plateau
 from torchrl_priors.schedules import CoeffScheduler
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from recipes.metrics import ConfidenceInterval
+from recipes.plots import curve_panels, interval_panels, profile_panels
 from recipes.report.tables import ALL, Study
-from torchrl_priors.metrics import ConfidenceInterval
-from torchrl_priors.plots import curve_panels, interval_panels, profile_panels
 
 __all__ = ["TRAINING", "curve_table", "figures"]
 

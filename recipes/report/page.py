@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from recipes.common.run_folder import write_file
 from recipes.gridworld import page as gridworld
+from recipes.plots import save_figure
 from recipes.report.config import ReportConfig, check
 from recipes.report.figures import TRAINING, curve_table, figures
 from recipes.report.markdown import interval, pivot, plus_minus, table
@@ -27,7 +28,6 @@ from recipes.report.runs import (
 )
 from recipes.report.study import is_study, read_study
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
-from torchrl_priors.plots import save_figure
 
 __all__ = ["report"]
 

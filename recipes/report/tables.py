@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from recipes.report.config import ReportConfig
-from recipes.report.runs import FinishedRun
-from torchrl_priors.methods import METHODS
-from torchrl_priors.metrics import (
+from recipes.metrics import (
     MIN_RUNS,
     ConfidenceInterval,
     area_ratio,
@@ -20,6 +17,9 @@ from torchrl_priors.metrics import (
     probability_of_improvement,
     stratified_bootstrap_ci,
 )
+from recipes.report.config import ReportConfig
+from recipes.report.runs import FinishedRun
+from torchrl_priors.methods import METHODS
 
 __all__ = ["ALL", "Study", "dynamics_table", "improvement_table", "ratio_table", "return_table"]
 

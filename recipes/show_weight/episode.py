@@ -10,18 +10,19 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from recipes import plots
 from recipes.common.checkpoints import Checkpoints
 from recipes.common.run_folder import read_json, sha256
 from recipes.mujoco.agent import Agent
 from recipes.mujoco.run import identity
 from recipes.mujoco.task import Task, open_task
+from recipes.plots.video import write_weight_video
 from recipes.show_weight.source import read_config, reading
-from torchrl_priors import PriorLogProb, StructuralDegradation, plots
+from torchrl_priors import PriorLogProb, StructuralDegradation
 from torchrl_priors.collectors import VectorCollector
 from torchrl_priors.collectors.vector_env import spread_seed
 from torchrl_priors.functional import td_residual
 from torchrl_priors.methods import get_method
-from torchrl_priors.plots.video import write_weight_video
 
 __all__ = ["show_episode"]
 

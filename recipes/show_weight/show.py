@@ -10,12 +10,12 @@ import numpy as np
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
+from recipes import plots
 from recipes.common.checks import check_keys
 from recipes.gridworld.run_parts import parse_prior
 from recipes.gridworld.study import TaughtWorld, make_learner
 from recipes.report.runs import is_gridworld
 from recipes.show_weight.source import read_config, reading
-from torchrl_priors import plots
 from torchrl_priors.methods import get_method
 
 
@@ -107,12 +107,7 @@ def _maps(cfg: ShowConfig, study: Any, folder: Path, out: Path) -> list[Path]:
         weight = square(np.where(visits[point - 1] > 0, weights[point - 1], np.nan)[state])
         maps[f"After {point * study.evaluation.interval:,} transitions"] = np.where(blank, np.nan, weight)
     figure = plots.weight_maps(
-        {
-            "walls": square(world.kind == 1),
-            "rewards": square(world.reward),
-            "terminal": square(world.terminal),
-            "start": divmod(int(world.start), world.size),
-        },
+        taught.grid.layers(),
         maps,
         square(bad[state]),
         steps=np.arange(1, last + 1) * study.evaluation.interval,

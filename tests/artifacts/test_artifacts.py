@@ -98,7 +98,7 @@ class TestRoundTrip:
         with pytest.raises(AttributeError):
             manifest.seed = 1  # type: ignore[misc]
 
-    def test_saving_copies(self, tmp_path: Path) -> None:
+    def test_a_saved_prior_does_not_follow_its_network(self, tmp_path: Path) -> None:
         network = net()
         save_prior(tmp_path / "prior", ModulePrior(network, "mean", std=1.0), env_id="Toy-v0")
         expected = advice(load_prior(tmp_path / "prior"))
@@ -106,7 +106,7 @@ class TestRoundTrip:
             network[0].weight.add_(1)
         assert torch.equal(advice(load_prior(tmp_path / "prior")), expected)
 
-    def test_another_key_can_be_read(self, saved: Saved) -> None:
+    def test_a_loaded_prior_can_read_another_key(self, saved: Saved) -> None:
         batch = raw_batch(6)
         expected = load_prior(saved.path).get_dist(batch).mean
         moved = TensorDict({"agent": {"pixels": batch["observation"]}}, batch_size=[6])
@@ -168,7 +168,7 @@ class Own(nn.Tanh):
 class TestSavingRefuses:
     @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
     @pytest.mark.parametrize("name", ["weight", "scale", "mean", "var"])
-    def test_what_is_not_finite(self, tmp_path: Path, name: str, value: float) -> None:
+    def test_a_prior_that_is_not_finite_is_not_saved(self, tmp_path: Path, name: str, value: float) -> None:
         actor, normalizer = trained()
         parameters = {
             key: parameter for key, parameter in actor.named_parameters() if key.endswith(("2.weight", "scale"))
@@ -219,7 +219,7 @@ class TestSavingRefuses:
             save_prior(tmp_path / "prior", prior(), env_id="Toy-v0")
         assert not list(tmp_path.iterdir())
 
-    def test_a_folder_that_is_missing(self, tmp_path: Path) -> None:
+    def test_a_prior_is_not_saved_to_a_folder_that_is_missing(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError, match=r"No folder .*no to write prior in"):
             save_prior(tmp_path / "no" / "prior", UniformPrior(2), env_id="Hopper-v5")
 

@@ -89,14 +89,14 @@ class TestDamage:
 
 
 class TestForeignFiles:
-    def test_a_missing_file(self, tmp_path: Path) -> None:
+    def test_a_missing_file_is_refused(self, tmp_path: Path) -> None:
         for path in (tmp_path / "no", tmp_path):
             for reader in (load_prior, read_manifest):
                 with pytest.raises(FileNotFoundError, match="No file of a prior at"):
                     reader(path)
 
     @pytest.mark.parametrize("data", [b"", b"policy", b"\x80\x04", b"PK\x03\x04" + b"\0" * 100, b"{}" * 50])
-    def test_no_safetensors(self, tmp_path: Path, data: bytes) -> None:
+    def test_a_file_that_is_no_safetensors_is_refused(self, tmp_path: Path, data: bytes) -> None:
         (tmp_path / "policy").write_bytes(data)
         refused(tmp_path / "policy", "not a safetensors file")
 
@@ -120,7 +120,7 @@ class TestForeignFiles:
         refused(tmp_path / "policy", "manifest is not")
 
     @pytest.mark.parametrize("version", [0, 1, 3, "1", None, True, 2.0])
-    def test_another_version(self, saved: Saved, version: Any) -> None:
+    def test_a_file_of_another_version_is_refused(self, saved: Saved, version: Any) -> None:
         saved.path.write_bytes(pack(*contents(saved.path), version=version))
         what = "write it again by save_prior" if str(version) == "1" != version else "newer torchrl_priors"
         refused(saved.path, f"of version {version!r}, .*{what}")
@@ -141,7 +141,9 @@ class TestForeignFiles:
             ("prior", [], "its prior must be an object of JSON, got"),
         ],
     )
-    def test_an_impossible_manifest(self, saved: Saved, entry: str, value: Any, match: str) -> None:
+    def test_a_file_with_an_impossible_manifest_is_refused(
+        self, saved: Saved, entry: str, value: Any, match: str
+    ) -> None:
         tensors, manifest = contents(saved.path)
         saved.path.write_bytes(pack(tensors, {**manifest, entry: value}))
         refused(saved.path, match)
@@ -155,7 +157,9 @@ class TestForeignFiles:
     @pytest.mark.parametrize("dtype", ["F4", "F8_E8M0", "C64", "BOOL", "U16", "object", ""])
     @pytest.mark.parametrize("shape", [[ACTIONS], [-ACTIONS], [0], [2**62, 2], ["3"]])
     @pytest.mark.parametrize("offsets", [(0, 12), (12, 0), (0, 2**62), (4, 16), (-12, 0)])
-    def test_an_impossible_header(self, saved: Saved, dtype: str, shape: list[Any], offsets: tuple[int, int]) -> None:
+    def test_a_file_with_an_impossible_header_is_refused(
+        self, saved: Saved, dtype: str, shape: list[Any], offsets: tuple[int, int]
+    ) -> None:
         data = saved.path.read_bytes()
         size = int.from_bytes(data[:8], "little")
         header = json.loads(data[8 : 8 + size])

@@ -62,7 +62,7 @@ class TestPrior:
         assert torch.equal(prior(batch)["prior", "loc"], played["loc"])
         assert torch.equal(batch["prior", "scale"], played["scale"])
 
-    def test_reads_raw_observations_never_the_normalised_ones_of_the_student(self, saved: Saved) -> None:
+    def test_a_loaded_prior_reads_raw_observations_never_those_that_the_student_normalised(self, saved: Saved) -> None:
         prior = load_prior(saved.path)
         assert prior.in_keys == ["observation"]
         alone = raw_batch(6)
@@ -89,7 +89,7 @@ class TestPrior:
         actor, batch = trained()[0], raw_batch(2, 6)
         assert torch.equal(policy_prior(actor, None).get_dist(batch).mean, act(actor, None, batch)["loc"])
 
-    def test_writes_under_its_namespace_only(self, saved: Saved) -> None:
+    def test_a_loaded_prior_writes_under_its_namespace_only(self, saved: Saved) -> None:
         batch = raw_batch(6)
         load_prior(saved.path, namespace="teacher")(batch)
         assert set(batch.keys(True, True)) == {"observation", ("teacher", "loc"), ("teacher", "scale")}
@@ -99,7 +99,7 @@ class TestPrior:
         for prior in (load_prior(saved.path), policy_prior(saved.actor, None)):
             assert torch.equal(prior.get_dist(batch.to(torch.float64)).mean, prior.get_dist(batch).mean)
 
-    def test_is_frozen(self, saved: Saved) -> None:
+    def test_a_loaded_prior_is_frozen(self, saved: Saved) -> None:
         prior = load_prior(saved.path).train()
         assert not prior.training
         assert list(prior.parameters())
@@ -132,7 +132,7 @@ class TestPrior:
         with pytest.raises(ValueError, match="action space"):
             load_prior(saved.path).log_prob(raw_batch(6).set("action", torch.zeros(6, ACTIONS + 1)))
 
-    def test_it_is_made_of_actors_of_make_actor_only(self) -> None:
+    def test_a_policy_prior_is_made_of_actors_of_make_actor_only(self) -> None:
         own = TensorDictModule(nn.Linear(OBS, ACTIONS), in_keys=["observation"], out_keys=["logits"])
         inner = make_actor(OBS, ACTIONS).module[0]
         normalised = TensorDictModule(nn.BatchNorm1d(OBS), in_keys=["observation"], out_keys=["observation_norm"])
@@ -150,7 +150,7 @@ class TestPrior:
             with pytest.raises(TypeError, match=r"Expected an actor of torchrl_priors\.networks\.make_actor"):
                 policy_prior(actor, None)
 
-    def test_its_statistics_are_a_running_norm_of_its_observations(self) -> None:
+    def test_statistics_of_a_policy_prior_are_a_running_norm_of_its_observations(self) -> None:
         with pytest.raises(TypeError, match="RunningNorm, got BatchNorm1d"):
             policy_prior(make_actor(OBS, ACTIONS), nn.BatchNorm1d(OBS))  # type: ignore[arg-type]
         with pytest.raises(ValueError, match=r"shape \(4,\), and its statistics are of shape \(5,\)"):

@@ -116,6 +116,6 @@ def test_arrays_of_one_buffer_do_not_fill_the_memory() -> None:
 
 
 @pytest.mark.parametrize("value", [{(1, (2, 3)): ((), ((),))}, np.arange(3), spaces.Tuple([spaces.Discrete(2)] * 3)])
-def test_what_is_honest_passes(value: Any) -> None:
+def test_honest_pickles_are_read(value: Any) -> None:
     for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
         check_program(pickle.dumps([value, value], protocol=protocol))

@@ -128,7 +128,7 @@ class Bomb:
 
 
 class TestNothingRuns:
-    def test_in_statistics(self, tmp_path: Path) -> None:
+    def test_no_code_of_statistics_runs(self, tmp_path: Path) -> None:
         (tmp_path / "vec.pkl").write_bytes(pickle.dumps({"obs_rms": Bomb(tmp_path / "ran")}))
         with pytest.raises(ArtifactError, match=r"pathlib.*nothing in it was run"):
             read_vecnormalize(tmp_path / "vec.pkl")
@@ -152,7 +152,9 @@ class TestNothingRuns:
 
     @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(data=st.data())
-    def test_damaged_statistics(self, saved: Callable[[str], Saved], tmp_path: Path, data: st.DataObject) -> None:
+    def test_damaged_statistics_raise_an_artifact_error_at_most(
+        self, saved: Callable[[str], Saved], tmp_path: Path, data: st.DataObject
+    ) -> None:
         content = bytearray(saved("ppo").vecnormalize.read_bytes())  # type: ignore[union-attr]
         for _ in range(data.draw(st.integers(1, 4))):
             content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
@@ -163,7 +165,9 @@ class TestNothingRuns:
 
     @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(data=st.data())
-    def test_damaged_models(self, saved: Callable[[str], Saved], tmp_path: Path, data: st.DataObject) -> None:
+    def test_damaged_models_raise_an_artifact_error_at_most(
+        self, saved: Callable[[str], Saved], tmp_path: Path, data: st.DataObject
+    ) -> None:
         content = bytearray(saved("a2c_linear").path.read_bytes())
         for _ in range(data.draw(st.integers(1, 4))):
             content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))

@@ -13,6 +13,8 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, NormalParamExtractor, ProbabilisticActor, TanhNormal
 
+from torchrl_priors.collectors import VectorCollector
+
 
 class Script(gymnasium.Env):
     """Episodes of given lengths; observes (identity, episode, step) and is paid the number of the step."""
@@ -86,3 +88,12 @@ def same(first: Any, second: Any) -> bool:
     """Whether two tensordicts have the same keys and, to the bit, the same values."""
     keys = set(first.keys(True, True))
     return keys == set(second.keys(True, True)) and all(torch.equal(first[key], second[key]) for key in keys)
+
+
+LENGTHS = [(2, 3), (4,), (5, 1)]
+
+
+def collector(policy: Any = None, *, frames: int = 24, **kwargs: Any) -> VectorCollector:
+    kwargs.setdefault("seed", 0)
+    env = kwargs.pop("env", None) or scripts(*LENGTHS)
+    return VectorCollector(env, policy or gaussian(3, 2), frames_per_batch=frames, **kwargs)

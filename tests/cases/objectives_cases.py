@@ -28,10 +28,7 @@ def make_actor(kind="categorical", observation="observation", action="action", h
     if kind in ("categorical", "one_hot"):
         net, params = nn.Sequential(*layers, nn.Linear(width, ACTIONS)), ["logits"]
     else:
-        net, params = (
-            nn.Sequential(*layers, nn.Linear(width, 2 * ACTIONS), NormalParamExtractor()),
-            ["loc", "scale"],
-        )
+        net, params = (nn.Sequential(*layers, nn.Linear(width, 2 * ACTIONS), NormalParamExtractor()), ["loc", "scale"])
     module = TensorDictModule(net, in_keys=[observation], out_keys=params)
     return ProbabilisticActor(
         module, in_keys=params, out_keys=[action], distribution_class=DISTRIBUTIONS[kind], return_log_prob=True
@@ -121,3 +118,22 @@ def make_ppo_prior(
     prior_critic = critic if options.get("td_error") == "shaped" else prior_critic
     prior_loss = AE2RLoss(actor, prior, prior_weight, prior_critic, functional=functional, **options)
     return loss_class(actor, critic, prior_loss, **kwargs)
+
+
+def make_ae2r(method="ae2r", kind="categorical", **kwargs):
+    options = {"prior_weight": make_weight(), "critic_network": make_critic(), **kwargs}
+    return AE2RLoss(make_actor(kind), make_actor(kind), method=method, **options)
+
+
+def make_networks(kind="categorical"):
+    return {
+        "actor": make_actor(kind),
+        "critic": make_critic(),
+        "prior": make_actor(kind),
+        "prior_weight": make_weight(),
+        "prior_critic": make_critic(),
+    }
+
+
+def make_ppo_loss(method="ae2r", kind="categorical", **kwargs):
+    return make_ppo_prior(**{**make_networks(kind), "method": method, **kwargs})

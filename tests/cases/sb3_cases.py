@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
+from tensordict import TensorDict
 from torch import nn
 
 with warnings.catch_warnings():
@@ -137,3 +138,17 @@ def rewrite(
                 content = json.dumps(data(json.loads(content))).encode()
             out.writestr(name, content)
     return target
+
+
+NUMBER = 1000
+
+
+def observations(case: Model, number: int = NUMBER) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    if case.observations.dtype == np.uint8:
+        return rng.integers(0, 256, (number, *case.observations.shape), dtype=np.uint8)
+    return rng.normal(size=(number, 3)) * np.array([0.1, 1.0, 30.0]) + 2
+
+
+def batch_of(raw: np.ndarray) -> TensorDict:
+    return TensorDict(observation=torch.as_tensor(raw), batch_size=[len(raw)])

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from recipes.gridworld import run_parts, tabular
-from torchrl_priors.envs import GridWorlds
-from torchrl_priors.envs.worlds import KINDS, MOVES
+from recipes.gridworld.worlds import KINDS, MOVES, GridWorlds
 from torchrl_priors.methods import get_method
 
 PRIORS = ["expert", "random_30", "structural_3"]

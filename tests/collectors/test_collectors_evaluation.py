@@ -22,7 +22,7 @@ def test_short_episodes_are_not_favoured() -> None:
 
 
 @pytest.mark.parametrize("episodes", [1, 2, 3, 4, 7])
-def test_any_number_of_episodes(episodes: int) -> None:
+def test_any_number_of_episodes_is_evaluated(episodes: int) -> None:
     result = evaluate(scripts((2, 5), (3,), (4,)), gaussian(3, 2), episodes=episodes)
     assert result.lengths.tolist() == [2, 3, 4, 5, 3, 4, 2][:episodes]
     assert result.returns.dtype == torch.float64

@@ -164,7 +164,7 @@ def test_a_model_that_is_changed_counts() -> None:
     assert fast.fast
 
 
-def test_another_xml_file() -> None:
+def test_another_xml_file_takes_gymnasiums_steps() -> None:
     kwargs = {"xml_file": str(ASSETS / "walker2d.xml"), "healthy_z_range": (0.5, 2.0)}
     fast, plain = make_vector_env("Walker2d-v5", 2, **kwargs), gymnasiums("Walker2d-v5", 2, **kwargs)
     for env in (fast, plain):
@@ -208,7 +208,7 @@ class TestPlainSteps:
         makers = [lambda w=w: gymnasium.make("Hopper-v5", healthy_reward=w) for w in (1.0, 2.0)]
         assert not MujocoVectorEnv(makers).fast
 
-    def test_an_attribute_set_later(self) -> None:
+    def test_an_attribute_set_later_makes_steps_plain(self) -> None:
         env, plain = make_vector_env("HalfCheetah-v5", 2), gymnasiums("HalfCheetah-v5", 2)
         for each in (env, plain):
             each.reset(seed=0)

@@ -75,7 +75,7 @@ class TestContinuing:
         assert second.frames == first.frames == 200
         assert torch.equal(first.normalizer.var, second.normalizer.var)
 
-    def test_it_may_stop_after_every_rollout(self) -> None:
+    def test_a_collector_may_stop_after_every_rollout(self) -> None:
         whole = collector("Humanoid-v5")
         current = collector("Humanoid-v5", policy=whole.policy)
         for expected in rollouts(whole, 5):
@@ -84,7 +84,7 @@ class TestContinuing:
             current = collector("Humanoid-v5", seed=9, policy=whole.policy)
             current.load_state_dict(state)
 
-    def test_it_may_stop_before_the_first_rollout(self) -> None:
+    def test_a_collector_may_stop_before_the_first_rollout(self) -> None:
         first = collector()
         second = collector(seed=1, policy=first.policy)
         second.load_state_dict(first.state_dict())

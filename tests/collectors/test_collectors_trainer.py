@@ -57,7 +57,7 @@ def buffer(size: int) -> TensorDictReplayBuffer:
 class TestTrainers:
     @pytest.mark.parametrize("functional", [True, False])
     @pytest.mark.parametrize("logging", [True, False])
-    def test_ppo_trainer(self, functional: bool, logging: bool) -> None:
+    def test_ppo_trainer_trains_the_actor_of_a_vector_collector(self, functional: bool, logging: bool) -> None:
         actor = gaussian(3, 2)
         parts = ActionPrior(gaussian(3, 2)), PriorWeight(nn.Linear(3, 1)), critic()
         prior_loss = AE2RLoss(actor, *parts, method="ae2r", functional=functional)
@@ -108,7 +108,7 @@ class TestTrainers:
         first, second = trainer.collector.rollout(), other.collector.rollout()
         assert same(first, second)
 
-    def test_it_does_not_collect_in_the_background(self) -> None:
+    def test_a_vector_collector_does_not_collect_in_the_background(self) -> None:
         with pytest.raises(NotImplementedError, match="async_collection=False"):
             collector().start()
 
@@ -132,7 +132,7 @@ class TestLoops:
             assert hasattr(VectorCollector, name)
             assert hasattr(Collector, name) or name == "requested_frames_per_batch"
 
-    def test_a_loop(self) -> None:
+    def test_a_loop_over_a_collector_ends_after_its_length(self) -> None:
         data = collector()
         assert len(data) == 3
         for number, batch in enumerate(data):  # noqa: B007
@@ -173,7 +173,7 @@ class TestLoops:
         assert (second["next", "step_count"][:, 0] == 1).all()
         assert (second["collector", "traj_ids"] > before).all()
 
-    def test_weights_of_every_kind(self) -> None:
+    def test_weights_of_every_kind_are_copied_into_the_policy(self) -> None:
         source = gaussian(3, 2)
         weights = TensorDict.from_module(source)
         for args, kwargs in (

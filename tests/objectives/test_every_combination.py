@@ -110,7 +110,7 @@ def train(method: str, discrete: bool, device: str, collect: Any) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("discrete", [True, False], ids=["discrete", "continuous"])
 @pytest.mark.parametrize("method", METHODS)
-def test_in_torchrls_collector(method: str, discrete: bool, device: str) -> None:
+def test_every_method_trains_in_torchrls_collector(method: str, discrete: bool, device: str) -> None:
     def collect(actor: ProbabilisticActor, postproc: PriorLogProb) -> Collector:
         return Collector(
             make_env(discrete),
@@ -128,7 +128,7 @@ def test_in_torchrls_collector(method: str, discrete: bool, device: str) -> None
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("method", METHODS)
-def test_in_the_vector_collector(method: str, device: str) -> None:
+def test_every_method_trains_in_the_vector_collector(method: str, device: str) -> None:
     """Continuous actions only, which is what it collects."""
     pytest.importorskip("gymnasium")
     from torchrl_priors.collectors import VectorCollector, make_vector_env

@@ -114,7 +114,7 @@ class TestPPO:
         loss = ours(*networks("categorical"), "ae2r").select_out_keys("loss_objective", "loss_prior")
         assert set(loss(sequences("categorical")).keys()) == {"loss_objective", "loss_prior"}
 
-    def test_it_has_no_target_networks_as_ppo_has_none(self):
+    def test_ppo_prior_loss_has_no_target_networks_as_ppo_has_none(self):
         with pytest.raises(Exception, match=r"(?i)target"):
             SoftUpdate(ours(*networks("categorical"), "e2r"), eps=0.9)
 

@@ -64,7 +64,7 @@ def layouts(data: TensorDictBase) -> dict[str, TensorDictBase]:
     absent=st.booleans(),
     seed=st.integers(0, 1000),
 )
-def test_of_a_batch_do_not_matter(
+def test_the_layout_of_a_batch_does_not_matter(
     method: str, shape: tuple[int, ...], observations: int, masked: bool, absent: bool, seed: int
 ) -> None:
     loss = make_loss(method, observations)

@@ -28,13 +28,13 @@ def make_loss(method="ae2r", kind="categorical", **kwargs):
     return AE2RLoss(make_actor(kind), make_actor(kind), method=method, **options)
 
 
-def test_default_keys():
+def test_ae2r_loss_has_these_keys_by_default():
     loss = make_loss()
     assert {key: getattr(loss.tensor_keys, key) for key in DEFAULT_KEYS} == DEFAULT_KEYS
     assert set(loss.tensor_keys.__dataclass_fields__) == set(DEFAULT_KEYS)
 
 
-def test_unknown_keys_are_refused():
+def test_unknown_keys_of_ae2r_loss_are_refused():
     with pytest.raises(ValueError, match="not an accepted tensordict key"):
         make_loss().set_keys(advantages="advantage")
 
@@ -62,7 +62,7 @@ def test_renamed_keys_give_the_same_losses(method, name):
     assert same_tensors(dict(losses.items()), dict(expected.items()))
 
 
-def test_nested_observations():
+def test_ae2r_loss_reads_nested_observations():
     keys = {"observation": ("agents", "observation")}
     loss = AE2RLoss(make_actor(**keys), make_actor(**keys), make_weight(**keys), make_critic(**keys))
     total(loss(make_batch(**keys))).backward()
@@ -86,7 +86,7 @@ def test_in_keys_are_all_that_is_read(method, td_error):
 
 
 @pytest.mark.parametrize("method", ["e2r", "ae2r", "aer", "kickstart", "aligned"])
-def test_dispatch(method):
+def test_ae2r_loss_of_tensors_is_that_of_the_tensordict(method):
     loss = make_loss(method)
     data = make_batch()
     data["raw_advantage"] = data["advantage"]
@@ -111,7 +111,7 @@ def test_dispatch_with_selected_out_keys():
 
 @pytest.mark.parametrize("batch", [(6,), (2, 3)])
 @pytest.mark.parametrize("method", ["ae2r", "aer", "aligned", "kickstart"])
-def test_reductions(method, batch):
+def test_reduced_losses_of_ae2r_are_those_of_its_steps(method, batch):
     loss = make_loss(method, reduction="none")
     data = make_batch(batch=batch)
     each = loss(data)
@@ -144,7 +144,7 @@ def test_state_dict_restores_the_losses(functional):
     assert same_tensors(dict(loss(data).items()), dict(other(data).items()))
 
 
-def test_deep_copy_is_independent():
+def test_a_deep_copy_of_ae2r_loss_is_independent():
     loss = make_loss()
     twin = copy.deepcopy(loss)
     data = make_batch()
@@ -190,7 +190,7 @@ def test_reset_leaves_the_shaped_critic_alone():
     assert (loss.critic_network_params == before).all()
 
 
-def test_moves_to_another_dtype():
+def test_ae2r_loss_moves_to_another_dtype():
     loss = make_loss().to(torch.double)
     data = make_batch().apply(lambda x: x.double() if x.is_floating_point() else x)
     losses = loss(data)
@@ -200,7 +200,7 @@ def test_moves_to_another_dtype():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_moves_to_a_gpu():
+def test_ae2r_loss_moves_to_a_gpu():
     loss = make_loss()
     data = make_batch()
     expected = loss(data)
@@ -264,7 +264,7 @@ def test_methods_without_a_loss_have_none(method):
         ({"weight_target": "advantage", "td_error": "shaped"}, "has seen the bonus"),
     ],
 )
-def test_bad_options_are_refused(options, message):
+def test_bad_options_of_ae2r_loss_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         make_loss(**options)
 

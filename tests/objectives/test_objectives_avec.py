@@ -66,7 +66,7 @@ def test_other_losses_are_those_of_the_parent(loss_class):
     assert (losses["loss_critic"] - expected["loss_critic"]).abs() > 1e-3
 
 
-def test_reinforce_too():
+def test_avec_of_reinforce_is_the_variance_of_the_residual():
     class AVECReinforce(AVECMixin, ReinforceLoss):
         pass
 

@@ -174,7 +174,7 @@ def test_a_selected_loss_trains_its_network_only():
             assert torch.equal(value, before.get_parameter(name)), name
 
 
-def test_it_goes_on_from_a_saved_state_bit_by_bit():
+def test_a_compiled_step_goes_on_from_a_saved_state_bit_by_bit():
     batch, indices = make_data()
     (loss, optimizer, step), _ = both()
     step(batch, indices[:5])

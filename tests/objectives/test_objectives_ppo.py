@@ -14,6 +14,8 @@ from objectives_cases import (
     make_batch,
     make_constant_weight,
     make_critic,
+    make_networks,
+    make_ppo_loss,
     make_ppo_prior,
     make_weight,
     same_tensors,
@@ -24,20 +26,6 @@ from torchrl.objectives.value import GAE
 
 from torchrl_priors.methods import METHODS
 from torchrl_priors.objectives import AE2RLoss, AVECMixin, ClipPPOPriorLoss
-
-
-def make_networks(kind="categorical"):
-    return {
-        "actor": make_actor(kind),
-        "critic": make_critic(),
-        "prior": make_actor(kind),
-        "prior_weight": make_weight(),
-        "prior_critic": make_critic(),
-    }
-
-
-def make_loss(method="ae2r", kind="categorical", **kwargs):
-    return make_ppo_prior(**{**make_networks(kind), "method": method, **kwargs})
 
 
 def train(loss, data, networks, steps=5):
@@ -103,7 +91,7 @@ def test_the_teacher_changes_the_students_gradient(method):
     assert same_tensors(critic, plain[1])
 
 
-def test_teacher_never_changes():
+def test_the_teacher_of_ppo_prior_loss_never_changes():
     networks, data = make_networks(), make_batch()
     before = copy.deepcopy(dict(networks["prior"].named_parameters()))
     loss = make_ppo_prior(**networks)
@@ -143,7 +131,7 @@ def test_each_loss_reaches_its_own_network_only(method, td_error, functional):
 
 @pytest.mark.parametrize("td_error", ["original", "shaped"])
 @pytest.mark.parametrize("method", METHODS)
-def test_its_losses_are_those_of_the_two_modules(method, td_error):
+def test_losses_of_ppo_prior_loss_are_those_of_the_two_modules(method, td_error):
     networks, data = make_networks(), make_batch()
     losses = make_ppo_prior(**networks, method=method, td_error=td_error, aux_coeff=0.3, gamma=0.9)(data)
     ppo = ClipPPOLoss(networks["actor"], networks["critic"])(data)
@@ -159,27 +147,12 @@ def test_its_losses_are_those_of_the_two_modules(method, td_error):
     assert same_tensors(losses.to_dict(), {**ppo.to_dict(), **prior.to_dict()})
 
 
-def test_every_parameter_is_listed_once():
-    networks = make_networks()
-    loss = make_ppo_prior(**networks)
-    parameters = list(loss.parameters())
-    assert len(parameters) == len(set(parameters))
-    assert set(parameters) == {p for network in networks.values() for p in network.parameters()}
-
-
-def test_parameters_stay_shared_after_a_move():
-    loss = make_loss(td_error="shaped").to(torch.double)
-    for name in ("actor_network_params", "critic_network_params"):
-        mine, inner = (dict(getattr(x, name).named_parameters()) for x in (loss, loss.prior_loss))
-        assert all(inner[key] is mine[key] and inner[key].dtype == torch.double for key in mine)
-
-
 def test_an_unshaped_batch_is_refused_rather_than_trained_on():
     """Without an advantage the loss estimates its own: from the shaped reward, or not at all."""
     data = make_batch().exclude("advantage", "value_target", ("next", "shaped_reward"))
     with pytest.raises((KeyError, AttributeError, RuntimeError, TypeError)):
-        make_loss("e2r")(data)
-    make_loss("kickstart")(data)  # no bonus: the reward is the reward
+        make_ppo_loss("e2r")(data)
+    make_ppo_loss("kickstart")(data)  # no bonus: the reward is the reward
 
 
 def test_own_advantages_are_estimated_from_the_shaped_reward():
@@ -195,7 +168,7 @@ def test_own_advantages_are_estimated_from_the_shaped_reward():
 
 
 def test_one_discount_for_the_advantage_and_the_weight():
-    loss = make_loss(gamma=0.7)
+    loss = make_ppo_loss(gamma=0.7)
     loss.make_value_estimator()
     assert loss.value_estimator.gamma == pytest.approx(0.7)
     loss.make_value_estimator(gamma=0.5)
@@ -205,15 +178,15 @@ def test_one_discount_for_the_advantage_and_the_weight():
 
 def test_reward_key_that_hides_the_bonus_warns():
     with pytest.warns(UserWarning, match="do not see the prior's bonus"):
-        make_loss("e2r").set_keys(reward="reward")
+        make_ppo_loss("e2r").set_keys(reward="reward")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        make_loss("kickstart").set_keys(reward="reward")
-        make_loss("e2r").set_keys(reward="my_reward")
+        make_ppo_loss("kickstart").set_keys(reward="reward")
+        make_ppo_loss("e2r").set_keys(reward="my_reward")
 
 
 def test_each_loss_has_its_keys_and_the_end_is_one():
-    loss = make_loss()
+    loss = make_ppo_loss()
     loss.set_keys(reward=("a", "shaped"), terminated="end", value="v")
     loss.prior_loss.set_keys(reward=("a", "raw"), prior_log_prob="lp", prior_weight="w")
     assert loss.prior_loss.tensor_keys.terminated == "end"
@@ -235,85 +208,7 @@ def test_another_student_or_critic_in_the_prior_loss_is_refused(td_error):
             ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, make_actor(), **options))
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_dispatch(method):
-    loss = make_loss(method)
-    data = make_batch()
-    data["raw_advantage"] = data["advantage"]
-    kwargs = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys}
-    loss.in_keys = [*loss.in_keys, "advantage", "value_target"]
-    values = loss(**kwargs, advantage=data["advantage"], value_target=data["value_target"])
-    expected = loss(data)
-    for key, value in zip(loss.out_keys, values, strict=True):
-        torch.testing.assert_close(value, expected[key])
-
-
-@pytest.mark.parametrize("batch", [(6,), (2, 3)])
-@pytest.mark.parametrize("method", ["ae2r", "aligned"])
-def test_reductions(method, batch):
-    loss = make_loss(method, reduction="none")
-    data = make_batch(batch=batch)
-    each = loss(data)
-    for key in loss_names(each):
-        assert each[key].shape == batch
-    for reduction in ("mean", "sum"):
-        loss.reduction = reduction  # also after construction
-        reduced = loss(data)
-        for key in loss_names(each):
-            torch.testing.assert_close(reduced[key], getattr(each[key], reduction)())
-
-
-def test_mask_key_reaches_both_losses():
-    loss = make_loss(normalize_advantage=False)
-    data = make_batch()
-    mask = torch.tensor([True, True, False, True, False, True])
-    expected = loss(data[mask])
-    data["valid"] = mask.unsqueeze(-1)
-    loss.loss_mask_key = "valid"
-    losses = loss(data)
-    for key in loss_names(expected):
-        torch.testing.assert_close(losses[key], expected[key])
-
-
-@pytest.mark.parametrize("functional", [True, False])
-@pytest.mark.parametrize("td_error", ["original", "shaped"])
-def test_state_dict_restores_the_losses(td_error, functional):
-    loss, other = (make_loss(td_error=td_error, functional=functional) for _ in range(2))
-    data = make_batch()
-    other.load_state_dict(copy.deepcopy(loss.state_dict()))
-    assert same_tensors(loss(data).to_dict(), other(data).to_dict())
-
-
-def test_deep_copy_keeps_parameters_shared_inside():
-    twin = copy.deepcopy(make_loss())
-    for p in twin.actor_network_params.parameters():
-        p.data.zero_()
-    assert not any(p.any() for p in twin.prior_loss.actor_network_params.parameters())
-
-
-@pytest.mark.parametrize("functional", [True, False])
-def test_reset_leaves_the_prior_alone(functional):
-    networks = make_networks()
-    before = {name: copy.deepcopy(network.state_dict()) for name, network in networks.items()}
-    make_ppo_prior(**networks, functional=functional).reset_parameters_recursive()
-    for name, network in networks.items():
-        for key, value in network.state_dict().items():
-            assert torch.equal(value, before[name][key]) == (name == "prior")
-
-
-@pytest.mark.parametrize("kind", ["categorical", "normal"])
-def test_compiled_forward_gives_the_same_numbers(kind):
-    loss, data = make_loss(kind=kind), make_batch(kind)
-    expected = loss(data)
-    torch._dynamo.reset()
-    losses = torch.compile(loss, backend="aot_eager")(data)
-    for key in loss_names(expected):
-        torch.testing.assert_close(losses[key], expected[key])
-    total(losses).backward()
-    assert all(p.grad is not None for p in loss.actor_network_params.parameters())
-
-
-def test_avec_and_prior_combine():
+def test_avec_and_ppo_prior_loss_combine():
     class Loss(AVECMixin, ClipPPOPriorLoss):
         pass
 
@@ -324,19 +219,3 @@ def test_avec_and_prior_combine():
     torch.testing.assert_close(losses["loss_critic"], error.var(correction=0))
     for key in loss_names(plain) - {"loss_critic"}:
         assert torch.equal(losses[key], plain[key])
-
-
-def test_options_of_ppo_pass_through():
-    loss = make_loss(clip_epsilon=0.3, critic_coeff=0.5, entropy_bonus=False, loss_critic_type="l2")
-    assert loss.clip_epsilon == pytest.approx(0.3)
-    assert loss.critic_coeff == 0.5
-    assert "loss_entropy" not in loss(make_batch())
-    loss.critic_coeff, loss.prior_loss.aux_coeff = 0.25, 0.1
-    assert loss.prior_loss.aux_coeff == pytest.approx(0.1)
-
-
-def test_bad_options_are_refused():
-    with pytest.raises(ValueError, match="Unknown method"):
-        make_loss("ppo")
-    with pytest.raises(ValueError, match="pass critic_network"):
-        make_loss(prior_critic=None)

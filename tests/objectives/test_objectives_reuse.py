@@ -59,7 +59,7 @@ def test_advice_in_the_batch_gives_the_same_losses_without_a_call_of_the_prior(k
         assert torch.equal(losses[key], value), key
 
 
-def test_its_in_keys_are_the_parameters_instead_of_what_the_prior_reads():
+def test_a_loss_that_reuses_parameters_reads_them_instead_of_what_the_prior_reads():
     prior = ActionPrior(make_actor("normal", observation="raw"))
     running, reusing = make_losses(make_actor("normal"), prior)
     assert "raw" in running.in_keys

@@ -124,7 +124,7 @@ def test_a_short_loop_learns_and_leaves_the_teacher(method):
 
 @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")  # the trainer is experimental, and says so
 @pytest.mark.parametrize("method", ["ae2r", "kickstart", "none"])
-def test_torchrl_trainer(method):
+def test_torchrls_trainer_learns_from_the_teacher(method):
     actor, _, prior, loss, postproc = make_all(method)
     before = copy.deepcopy(prior.state_dict())
     start = accuracy(actor)
@@ -198,7 +198,7 @@ def test_bonus_and_auxiliary_loss_share_a_random_draw():
 
 
 @pytest.mark.parametrize("weight", [PriorWeight.table(5), PriorWeight.constant(0.25)], ids=["table", "constant"])
-def test_tabular_prior_and_weight(weight):
+def test_a_tabular_prior_and_weight_train_together(weight):
     """Everything looked up by an integer state: the tables of the gridworld in the same loss."""
     logits = nn.Embedding(5, 2)
     actor = ProbabilisticActor(

@@ -103,7 +103,7 @@ def test_plays_in_an_environment_and_a_collector_with_a_new_draw_at_each_step() 
         assert batch["action"].shape == batch.batch_size
 
 
-def test_writes_the_action_under_its_key() -> None:
+def test_the_policy_of_a_prior_writes_the_action_under_its_key() -> None:
     teacher = prior()
     teacher.set_keys(action=("agent", "action"))
     assert teacher.policy().out_keys == [("agent", "action")]

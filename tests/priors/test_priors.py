@@ -91,7 +91,7 @@ class TestActionPrior:
         assert whole.shape == (2, 6)
         torch.testing.assert_close(whole[1, 4], prior.log_prob(batch[1, 4]))
 
-    def test_teacher_never_changes(self, actor: ProbabilisticActor) -> None:
+    def test_the_advice_of_an_action_prior_never_changes(self, actor: ProbabilisticActor) -> None:
         prior = ActionPrior(actor)
         before = copy.deepcopy(prior.state_dict())
         batch = actor(observations(5)).detach()
@@ -140,7 +140,7 @@ class TestActionPrior:
         assert torch.equal(batch["teachers", "first", "loc"], dist.base_dist.loc)
         assert torch.equal(batch["teachers", "first", "scale"], dist.base_dist.scale)
 
-    def test_dispatch_of_tensors(self) -> None:
+    def test_an_action_prior_takes_tensors_by_name(self) -> None:
         prior = ActionPrior(normal_actor())
         batch = observations(5)
         loc, scale = prior(observation=batch["observation"])
@@ -193,7 +193,7 @@ class TestActionPrior:
         normalised = batch.clone().set("observation", (raw - 1) / 2)
         torch.testing.assert_close(log_prob, ActionPrior(actor).log_prob(normalised))
 
-    def test_nested_keys(self) -> None:
+    def test_an_action_prior_reads_and_scores_nested_keys(self) -> None:
         net = TensorDictModule(
             nn.Linear(OBS, ACTIONS), in_keys=[("agent", "observation")], out_keys=[("agent", "logits")]
         )

@@ -29,7 +29,7 @@ from torchrl_priors.state_table import StateTable
 class TestBoltzmannPrior:
     Q = torch.tensor([[0.0, 1.0, 2.0], [3.0, 3.0, -1.0]])
 
-    def test_is_the_softmax_of_the_table(self) -> None:
+    def test_a_boltzmann_prior_is_the_softmax_of_the_table(self) -> None:
         batch = TensorDict(state=torch.tensor([[0, 1, 1]]), batch_size=[1, 3])
         probs = BoltzmannPrior(self.Q, 0.5).get_dist(batch).probs
         torch.testing.assert_close(probs, (self.Q / 0.5).softmax(-1)[[0, 1, 1]].unsqueeze(0))
@@ -105,7 +105,7 @@ class TestBoltzmannPrior:
         with pytest.raises(ValueError, match="integer"):
             BoltzmannPrior(self.Q).get_dist(TensorDict(state=state, batch_size=[2]))
 
-    def test_table_is_private(self) -> None:
+    def test_a_boltzmann_prior_has_a_table_of_its_own(self) -> None:
         q = self.Q.clone()
         prior = BoltzmannPrior(q)
         q.zero_()
@@ -142,7 +142,7 @@ class TestUniformPrior:
         torch.testing.assert_close(cross_entropy(student, prior.get_dist(batch)), torch.full((3,), 2.0).log())
 
     @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-    def test_actions_of_any_shape(self, shape: tuple[int, ...]) -> None:
+    def test_a_uniform_prior_is_uniform_over_actions_of_any_shape(self, shape: tuple[int, ...]) -> None:
         prior = UniformPrior(Bounded(-1.0, 1.0, shape=shape))
         log_prob = prior.log_prob(TensorDict(action=torch.zeros(5, 2, *shape), batch_size=[5, 2]))
         count = torch.Size(shape).numel()

@@ -38,7 +38,7 @@ TEACHERS: dict[str, Any] = {
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
 @pytest.mark.parametrize("name", TEACHERS)
-def test_it_is_the_density_of_the_scaled_action(name: str, shape: tuple[int, ...]) -> None:
+def test_a_rescaled_prior_has_the_density_of_the_scaled_action(name: str, shape: tuple[int, ...]) -> None:
     teacher = TEACHERS[name]()
     prior = RescaledPrior(teacher, LOW, HIGH, to_low=-1.0, to_high=torch.tensor([1.0, 3.0]))
     factor = torch.tensor([2.0, 4.0]) / (HIGH - LOW)
@@ -50,7 +50,7 @@ def test_it_is_the_density_of_the_scaled_action(name: str, shape: tuple[int, ...
         torch.testing.assert_close(ours.log_prob(scaled), expected)
 
 
-def test_it_plays_behind_action_scaling_as_the_teacher_does_before() -> None:
+def test_a_rescaled_prior_plays_behind_action_scaling_as_the_teacher_does_before() -> None:
     teacher = CallablePrior(lambda x: 1.5 * x[1:2], std=0.2)
     raw, scaled = GymEnv("Pendulum-v1"), TransformedEnv(GymEnv("Pendulum-v1"), ActionScaling())
     space = scaled.action_spec.space

@@ -82,7 +82,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], s
     return found
 
 
-def test_the_page_has_every_file(written: dict[tuple[str, str], set[str]]) -> None:
+def test_the_page_of_files_has_every_file(written: dict[tuple[str, str], set[str]]) -> None:
     assert set(written) == set(explained())
 
 

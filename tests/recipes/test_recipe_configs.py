@@ -106,6 +106,6 @@ def test_a_typo_is_refused_by_hydra(name: str, typo: str) -> None:
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_the_defaults_are_fine(name: str) -> None:
+def test_the_defaults_of_every_recipe_are_accepted(name: str) -> None:
     CHECKS[name](CONFIGS[name])
     assert not isinstance(CONFIGS[name], ListConfig)

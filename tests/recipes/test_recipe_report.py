@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 from report_cases import POINTS, config, spoil, write_run, write_study
 
+from recipes.metrics import iqm
 from recipes.report.__main__ import main
 from recipes.report.markdown import number, table
 from recipes.report.page import report
 from recipes.report.runs import find, name_priors, read, without_misfits
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
-from torchrl_priors.metrics import iqm
 
 
 def study_of(root: Path, *overrides: str) -> Study:

@@ -81,7 +81,7 @@ def test_the_teachers_return_is_a_line_where_a_table_tells_it(tables, tmp_path, 
     assert "n = 3" in next(iter(levels))
 
 
-def test_it_is_the_same_every_time(tables, tmp_path):
+def test_the_report_of_a_study_is_the_same_every_time(tables, tmp_path):
     for name in ("first", "second"):
         report(config(tables, tmp_path / name))
     for file in (tmp_path / "first").glob("*.csv"):

@@ -10,7 +10,7 @@ import torch
 from tabular_cases import PRIORS, STATES, PlainStudent, PlainWorld, action_values, drawn_worlds, make_run, random_tables
 
 from recipes.gridworld import run_parts, tabular
-from torchrl_priors.envs import GridMaps, transition
+from recipes.gridworld.env import GridMaps, transition
 from torchrl_priors.methods import METHODS, get_method
 
 POINTS, INTERVAL = 5, 30

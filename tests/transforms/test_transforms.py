@@ -70,7 +70,7 @@ class TestShift:
         ids=st.booleans(),
         boundary=st.sampled_from(["expected", "zero"]),
     )
-    def test_is_that_of_a_loop_over_time(
+    def test_shifted_log_prob_is_that_of_a_loop_over_time(
         self, shape: list[int], time_dim: int, seed: int, ends: float, ids: bool, boundary: Any
     ) -> None:
         time_dim %= len(shape)
@@ -87,7 +87,7 @@ class TestShift:
         assert new == {"prior_log_prob", ("next", "prior_log_prob")}
         assert (batch.select(*before.keys(True, True)) == before).all()
 
-    def test_by_hand(self) -> None:
+    def test_shifted_log_prob_is_that_worked_out_by_hand(self) -> None:
         no, yes = False, True
         batch = trajectories(6, ends=0.0)
         batch["state"] = torch.tensor([0, 1, 2, 3, 4, 5])
@@ -151,7 +151,7 @@ class TestShift:
         assert out["next", "prior_log_prob"].isfinite().all()
 
     @pytest.mark.parametrize("distribution_class", [IndependentNormal, d.Normal, TanhNormal])
-    def test_continuous_actions(self, distribution_class: type) -> None:
+    def test_continuous_actions_get_their_log_prob(self, distribution_class: type) -> None:
         def policy() -> ProbabilisticActor:
             net = nn.Sequential(nn.Linear(2, 6), NormalParamExtractor())
             module = Mod(net, in_keys=["observation"], out_keys=["loc", "scale"])
@@ -174,7 +174,7 @@ class TestShift:
             expected = torch.where(out["next", "terminated"][:, -1, 0], 0.0, expected)
             torch.testing.assert_close(out["next", "prior_log_prob"][:, -1, 0], expected)
 
-    def test_no_gradient(self) -> None:
+    def test_transforms_leave_no_gradient(self) -> None:
         student = tabular_actor(nn.Parameter(ACTOR_TABLE.clone()))
         batch = PriorLogProb(prior(), student, time_dim=1)(trajectories(2, 5))
         PriorBonus(PriorWeight.table(STATES))(batch)
@@ -197,7 +197,7 @@ class TestShift:
         assert next(student.buffers()).dtype is torch.float32
         assert {key.rsplit(".", 1)[-1] for key in transform.state_dict()} == {"table", "temperature", "bonus_coeff"}
 
-    def test_lazy_stacks(self) -> None:
+    def test_lazy_stacks_get_the_log_prob_of_dense_batches(self) -> None:
         batch = trajectories(4, 5, seed=1)
         lazy = LazyStackedTensorDict(*batch.clone().unbind(1), stack_dim=1)
         mixed = RandomDegradation(prior(), 0.5, seed=0)
@@ -236,7 +236,7 @@ class TestRandomDraws:
         first = transform(batch).clone()
         assert (transform(batch) == first).all()
 
-    def test_structural_degradation(self) -> None:
+    def test_a_structural_degradation_scores_bad_states_by_its_adversary(self) -> None:
         mask = torch.arange(STATES) % 2 == 0
         batch = trajectories(3, 9, seed=7)
         PriorLogProb(StructuralDegradation(prior(), mask), actor(), time_dim=1)(batch)
@@ -252,7 +252,7 @@ class TestTimeDimension:
         assert torch.equal(PriorLogProb(prior(), actor())(batch)["next", "prior_log_prob"], expected)
 
     @pytest.mark.parametrize("names", [None, ["time_", None]])
-    def test_is_never_guessed(self, names: list[str | None] | None) -> None:
+    def test_the_time_dimension_is_never_guessed(self, names: list[str | None] | None) -> None:
         batch = trajectories(3, 5)
         if names:
             batch.names = names

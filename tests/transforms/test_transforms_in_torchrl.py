@@ -71,32 +71,32 @@ def test_the_environment_of_these_tests_is_sound() -> None:
 class TestEnvironmentsAreRefused:
     MESSAGE = "reads whole trajectories"
 
-    def test_single_env(self, transform: Transform) -> None:
+    def test_a_single_environment_refuses_the_transform(self, transform: Transform) -> None:
         with pytest.raises(ValueError, match=self.MESSAGE):
             TransformedEnv(ChainEnv(), transform)
 
-    def test_appended_to_an_env(self, transform: Transform) -> None:
+    def test_an_environment_refuses_a_transform_that_is_appended(self, transform: Transform) -> None:
         env = TransformedEnv(ChainEnv(), Compose())
         with pytest.raises(ValueError, match=self.MESSAGE):
             env.append_transform(transform)
 
-    def test_trans_serial_env(self, transform: Transform) -> None:
+    def test_a_transformed_serial_env_refuses_the_transform(self, transform: Transform) -> None:
         with pytest.raises(ValueError, match=self.MESSAGE):
             TransformedEnv(SerialEnv(2, ChainEnv), transform)
 
-    def test_trans_parallel_env(self, transform: Transform) -> None:
+    def test_a_transformed_parallel_env_refuses_the_transform(self, transform: Transform) -> None:
         with pytest.raises(ValueError, match=self.MESSAGE):
             TransformedEnv(ParallelEnv(2, ChainEnv), transform)
 
     @pytest.mark.parametrize("name", TRANSFORMS)
     @pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
-    def test_serial_and_parallel_env(self, kind: type, name: str) -> None:
+    def test_environments_inside_serial_and_parallel_ones_refuse_the_transform(self, kind: type, name: str) -> None:
         with pytest.raises(ValueError, match=self.MESSAGE):
             kind(2, partial(bad_env, name)).rollout(2)
 
 
 class TestPlainCalls:
-    def test_no_env(self) -> None:
+    def test_a_batch_of_no_environment_gets_an_entry_per_step(self) -> None:
         batch = shaped(time_dim=1)(trajectories(2, 5))
         for key in KEYS:
             assert batch[key].shape == (2, 5, 1)
@@ -105,23 +105,23 @@ class TestPlainCalls:
         expected = PriorBonus(PriorWeight.constant(0.5))(PriorLogProb(prior(), actor(), time_dim=1)(trajectories(2, 5)))
         assert (shaped(time_dim=1)(trajectories(2, 5)) == expected).all()
 
-    def test_inverse_does_nothing(self) -> None:
+    def test_the_inverse_of_a_transform_does_nothing(self) -> None:
         batch = trajectories(2, 5)
         assert (shaped().inv(batch.clone()) == batch).all()
 
-    def test_rollout_is_a_batch(self) -> None:
+    def test_a_rollout_is_a_batch_that_transforms_take(self) -> None:
         env = chain_with_time_limit()
         batch = shaped()(env.rollout(10, actor(), break_when_any_done=False))
         assert all(key in batch.keys(True) for key in KEYS)
         assert (batch["next", "prior_bonus"][batch["next", "terminated"]] == 0).all()
 
-    def test_batched_rollout(self) -> None:
+    def test_a_rollout_of_several_environments_is_shifted_along_time(self) -> None:
         batch = shaped()(ChainEnv((3,)).rollout(6, actor(), break_when_any_done=False))
         assert batch["next", "prior_log_prob"].shape == (3, 6, 1)
 
 
 class TestReplayBuffer:
-    def test_extend(self) -> None:
+    def test_a_buffer_stores_what_the_transforms_write_to_the_whole_batch(self) -> None:
         buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(100), batch_size=4)
         buffer.append_transform(shaped(time_dim=0), invert=True)
         buffer.extend(trajectories(10))
@@ -157,7 +157,7 @@ class TestReplayBuffer:
             assert sample[key].shape == (3, 5, 1)
             assert torch.equal(sample[key], expected[key])
 
-    def test_sample_of_slices(self) -> None:
+    def test_slices_of_a_buffer_are_shifted_apart(self) -> None:
         steps = trajectories(40, ends=0.1)
         trajectory = torch.cat([torch.zeros(1), steps["next", "done"].squeeze(-1)[:-1].cumsum(0)]).long()
         steps["collector", "traj_ids"] = trajectory
@@ -185,7 +185,7 @@ class TestReplayBuffer:
 
 class TestCollectors:
     @pytest.mark.parametrize("make_env", [chain_with_time_limit, partial(ChainEnv, (3,))])
-    def test_postproc(self, make_env: Callable[[], EnvBase]) -> None:
+    def test_postproc_of_a_collector_writes_what_a_plain_call_does(self, make_env: Callable[[], EnvBase]) -> None:
         collector = Collector(make_env, actor(), frames_per_batch=30, total_frames=90, postproc=shaped(), **KNOWN)
         batches = list(self.closing(collector))
         assert len(batches) == 3
@@ -230,7 +230,7 @@ class TestCollectors:
 
 
 class TestKeysAndErrors:
-    def test_nested_keys_everywhere(self) -> None:
+    def test_transforms_read_and_write_nested_keys(self) -> None:
         def nest(batch: TensorDict, *keys: str) -> TensorDict:
             for key in keys:
                 batch["agent", key] = batch.pop(key)

@@ -5,11 +5,4 @@ from torchrl_priors.artifacts.files import load_prior, read_manifest, save_prior
 from torchrl_priors.artifacts.manifest import PriorManifest
 from torchrl_priors.artifacts.sb3 import load_sb3_prior
 
-__all__ = [
-    "ArtifactError",
-    "PriorManifest",
-    "load_prior",
-    "load_sb3_prior",
-    "read_manifest",
-    "save_prior",
-]
+__all__ = ["ArtifactError", "PriorManifest", "load_prior", "load_sb3_prior", "read_manifest", "save_prior"]

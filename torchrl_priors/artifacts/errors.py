@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
-
-__all__ = ["ArtifactError", "InertPickleError", "differing", "short"]
 
 _MAX_MESSAGE = 1500  # characters
 
@@ -28,6 +28,15 @@ class ArtifactError(ValueError):
 
 class InertPickleError(ArtifactError):
     """A pickle is damaged, or names something else than the numbers, spaces and statistics that are expected."""
+
+
+@contextmanager
+def refusing(path: str | os.PathLike[str], purpose: str) -> Iterator[None]:
+    """Names the file in what is said against it, and what it was to be used as."""
+    try:
+        yield
+    except ArtifactError as error:
+        raise ArtifactError(f"{path} can't be used as {purpose}: {error}.") from error
 
 
 def short(value: Any) -> str:

@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey
 from torchrl.data import TensorSpec
 
-from torchrl_priors.artifacts.errors import ArtifactError
+from torchrl_priors.artifacts.errors import ArtifactError, refusing
 from torchrl_priors.artifacts.format import pack, read
 from torchrl_priors.artifacts.manifest import PriorManifest, parse_manifest
 from torchrl_priors.artifacts.prior import build_prior, describe_prior
@@ -20,7 +20,7 @@ from torchrl_priors.artifacts.spaces import check_spaces
 from torchrl_priors.atomic import write_atomically
 from torchrl_priors.priors import Prior
 
-__all__ = ["load_prior", "read_manifest", "save_prior"]
+_PURPOSE = "a prior"
 
 
 def save_prior(
@@ -136,35 +136,18 @@ def load_prior(
             " teacher of another environment with the same spaces is taken."
         )
     if observation_spec is not None:
-        try:
+        with refusing(path, _PURPOSE):
             check_spaces(prior, observation_spec, action_spec)
-        except ArtifactError as error:
-            raise _refusal(path, error) from error
     return prior.to(device)
 
 
 def read_manifest(path: str | os.PathLike[str]) -> PriorManifest:
-    """Reads what the file of a prior says of it, and checks the file as :func:`load_prior` does.
-
-    Args:
-        path (str or path): the file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ArtifactError: as :func:`load_prior`.
-        ImportError: safetensors is not installed.
-    """
+    """Reads what the file of a prior says of it; checks the file, and raises, as :func:`load_prior` does."""
     return _read(Path(path))[0]
 
 
 def _read(path: Path, in_key: NestedKey | None = None, namespace: NestedKey = "prior") -> tuple[PriorManifest, Prior]:
-    try:
+    with refusing(path, _PURPOSE):
         tensors, values = read(path)
         manifest = parse_manifest(values)
         return manifest, build_prior(manifest.prior, tensors, in_key=in_key, namespace=namespace)
-    except ArtifactError as error:
-        raise _refusal(path, error) from error
-
-
-def _refusal(path: str | os.PathLike[str], error: ArtifactError) -> ArtifactError:
-    return ArtifactError(f"{path} can't be used as a prior: {error}.")

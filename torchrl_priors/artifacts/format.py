@@ -14,8 +14,6 @@ from torch import Tensor
 
 from torchrl_priors.artifacts.errors import ArtifactError, short
 
-__all__ = ["KIND", "pack", "read"]
-
 KIND = "torchrl_priors.prior"
 _VERSION = 2
 _FORMER_KIND = "torchrl_priors.policy"  # what only save_policy wrote, which is gone
@@ -34,11 +32,7 @@ def _safetensors() -> ModuleType:
 
 
 def pack(tensors: dict[str, Tensor], manifest: Any, *, version: Any = _VERSION) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        ValueError: the manifest, or the whole file, is too long to be read again.
-    """
+    """The bytes of a file that :func:`read` reads."""
     # the digest comes first, so that no zeros of the manifest are taken for its place
     about = json.dumps({"sha256": _NO_DIGEST, "version": version, "manifest": manifest}, allow_nan=False)
     data = _seal(_safetensors().torch.save(tensors, metadata={KIND: about}))
@@ -55,12 +49,7 @@ def _seal(data: bytes) -> bytes:
 
 
 def read(path: Path) -> tuple[dict[str, Tensor], Any]:
-    """The tensors and the manifest of a file whose version and digest are right. What they say is not checked.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ArtifactError: it is damaged or foreign.
-    """
+    """The tensors and the manifest of a file whose version and digest are right. What they say is not checked."""
     _safetensors()
     if not path.is_file():
         raise FileNotFoundError(f"No file of a prior at {path}.")

@@ -17,8 +17,6 @@ import numpy as np
 from torchrl_priors.artifacts.errors import InertPickleError, short
 from torchrl_priors.artifacts.pickle_program import check_program
 
-__all__ = ["MAX_BYTES", "StandIn", "read_pickle"]
-
 _SPACES = r"(gym|gymnasium)\.spaces(\.\w+)?\.(Box|Discrete|MultiDiscrete|MultiBinary|Dict|Tuple|Text)"
 _NUMBERS = r"numpy\.(bool_?|u?int(8|16|32|64)|float(16|32|64))"
 _NUMBER = re.compile(r"[biuf][1248]|bool_?|u?int(8|16|32|64)|float(16|32|64)")
@@ -156,16 +154,9 @@ class _Unpickler(pickle.Unpickler):
 
 
 def read_pickle(data: bytes) -> Any:
-    """What a pickle holds, without running anything that it names.
+    """What a pickle holds: numbers, strings, containers, arrays, and a :class:`StandIn` for each other object.
 
-    Args:
-        data (bytes): the pickle.
-
-    Returns:
-        Any: numbers, strings and containers; NumPy arrays; and a :class:`StandIn` for each other object.
-
-    Raises:
-        InertPickleError: it is damaged, or names something unknown.
+    Nothing that it names is run. What is damaged, or names something unknown, is an :class:`InertPickleError`.
 
     Examples:
         >>> import pickle
@@ -189,14 +180,10 @@ def read_pickle(data: bytes) -> Any:
 
 
 class _Resolver:
-    """Puts arrays in place of their stand-ins, at any depth.
-
-    Args:
-        room (int): bytes that the arrays may have in all: those of the pickle. Each array of an honest one has its own.
-    """
+    """Puts arrays in place of their stand-ins, at any depth."""
 
     def __init__(self, room: int) -> None:
-        self.room = room
+        self.room = room  # bytes of all arrays: those of the pickle, for each array of an honest one has its own
         # the original is kept beside its result, lest another object gets its id
         self.seen: dict[int, tuple[Any, Any]] = {}
 

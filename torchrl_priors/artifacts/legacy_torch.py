@@ -13,8 +13,6 @@ from torch import Tensor
 from torchrl_priors.artifacts.errors import InertPickleError, short
 from torchrl_priors.artifacts.pickle_program import check_program
 
-__all__ = ["LEGACY_START", "read_legacy"]
-
 LEGACY_START = pickle.dumps(0x1950A86A20F9469CFC6C, protocol=2)
 """How such a file begins: with the pickle of this number."""
 
@@ -78,15 +76,7 @@ class _Unpickler(pickle.Unpickler):
 def read_legacy(data: bytes) -> Any:
     """What ``torch.save`` wrote: pickles, of which the fourth is read without running it, and the memory of tensors.
 
-    Args:
-        data (bytes): the file; it begins with :data:`LEGACY_START`.
-
-    Returns:
-        Any: its object, a dictionary with tensors in place.
-
-    Raises:
-        InertPickleError: it names what is no tensor, or its storages are not what it says.
-        Exception: it is damaged, in any way.
+    A damaged file raises anything, one that names what is no tensor an :class:`InertPickleError`.
     """
     file = io.BytesIO(data)
     _, _, _, found, keys = (_read_pickle(file, data) for _ in range(5))  # magic number, version, machine

@@ -7,8 +7,6 @@ from typing import Any
 
 from torchrl_priors.artifacts.errors import ArtifactError, short
 
-__all__ = ["PriorManifest", "parse_manifest"]
-
 
 @dataclass(frozen=True)
 class PriorManifest:
@@ -32,11 +30,7 @@ class PriorManifest:
 
 
 def parse_manifest(values: Any) -> PriorManifest:
-    """A manifest from JSON, checked entry by entry, but for ``prior``, which is checked when it is built.
-
-    Raises:
-        ArtifactError: an entry is missing, not known, or of another type.
-    """
+    """A manifest from JSON, checked entry by entry, but for ``prior``, which is checked when it is built."""
     names = sorted(item.name for item in fields(PriorManifest))
     if not isinstance(values, dict) or sorted(values) != names:
         raise ArtifactError(f"its manifest must have the entries {', '.join(names)}")

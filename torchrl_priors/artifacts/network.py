@@ -23,17 +23,12 @@ from torchrl_priors.priors.layers import (
     TeacherInput,
 )
 
-__all__ = ["build_network", "check_values", "describe_network"]
-
 Parts = dict[str, Any]
 _MAX_SIZES = 100  # of one layer: a description must not make more layers than its tensors could fill
 
 
 def describe_network(network: nn.Module) -> Parts:
     """What kind of layers a network has, and their options: numbers as they are, a tensor by its shape.
-
-    Raises:
-        TypeError: it has a layer that is not known; its code has no place in a file.
 
     Examples:
         >>> describe_network(nn.Sequential(nn.Linear(3, 4), nn.Tanh()))["layers"]
@@ -56,15 +51,9 @@ def describe_network(network: nn.Module) -> Parts:
 
 
 def build_network(parts: Any, tensors: dict[str, Tensor], prefix: str = "") -> nn.Module:
-    """A network from its description and all of its tensors. No random number is drawn.
+    """A network from its description and its ``state_dict``, without drawing a random number.
 
-    Args:
-        parts: its description.
-        tensors (dict): its ``state_dict``.
-        prefix (str): what a message puts before the name of a tensor.
-
-    Raises:
-        ArtifactError: they do not fit each other, a tensor is not finite, or see :func:`check_values`.
+    What does not fit, or is not finite, is an :class:`ArtifactError`; messages put ``prefix`` before a tensor's name.
     """
     network = _skeleton(parts)
     expected = _sizes(network)
@@ -84,12 +73,7 @@ def build_network(parts: Any, tensors: dict[str, Tensor], prefix: str = "") -> n
 
 
 def check_values(network: nn.Module) -> None:
-    """Refuses finite numbers that make what is not finite.
-
-    Raises:
-        ArtifactError: statistics of observations have a negative variance or count, or overflow; a standard deviation
-            overflows or vanishes; or the bounds of actions are in the wrong order.
-    """
+    """Refuses finite numbers that make what is not finite: statistics, standard deviations and bounds of actions."""
     for layer in network.modules():
         if isinstance(layer, (ClipToBox, ScaleToBox)) and (layer.low > layer.high).any():
             raise ArtifactError("the lower bounds of its actions are above the upper ones")
@@ -225,10 +209,7 @@ def _log_std_range(value: Any) -> tuple[float, float]:
 _LAYERS: dict[str, tuple[type[nn.Module], dict[str, Callable[[Any], Any]]]] = {
     "clip_to_box": (ClipToBox, {"low": _tensor, "high": _tensor}),
     "gaussian_head": (GaussianHead, {"features": _count, "act_dim": _count, "log_std_range": _log_std_range}),
-    "gaussian_mlp": (
-        GaussianMLP,
-        {"obs_dim": _count, "act_dim": _count, "hidden": _counts, "activation": _activation},
-    ),
+    "gaussian_mlp": (GaussianMLP, {"obs_dim": _count, "act_dim": _count, "hidden": _counts, "activation": _activation}),
     "linear": (nn.Linear, {"in_features": _count, "out_features": _count, "bias": _has_tensor}),
     "nature_cnn": (NatureCNN, {"shape": _counts, "features": _count}),
     "running_norm": (RunningNorm, {"shape": _counts, "eps": _positive, "clip": _positive}),

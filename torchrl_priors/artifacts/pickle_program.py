@@ -7,8 +7,6 @@ from typing import IO, Any, NamedTuple
 
 from torchrl_priors.artifacts.errors import InertPickleError
 
-__all__ = ["check_program"]
-
 _MAX_STEPS = 1 << 17  # of the program: the statistics of hundreds of environments have fewer
 _MAX_DEPTH = 32  # of tuples in tuples, and
 _MAX_ENTRIES = 1000  # what they have in all: a shape, or the state of an array, has a few
@@ -25,10 +23,8 @@ def check_program(data: bytes | IO[bytes]) -> None:
     """Refuses a pickle that would crash or never end in the hands of an unpickler that runs nothing.
 
     The danger is in tuples, which are hashed when they are the key of a dictionary, at any depth and each time anew:
-    nested by the thousand, or each with the one before it twice. Other objects are held to the number of steps.
-
-    Args:
-        data (bytes or file): the pickle. A file is left where the pickle ends.
+    nested by the thousand, or each with the one before it twice. Other objects are held to the number of steps. A file
+    is left where the pickle ends.
 
     Raises:
         InertPickleError: its program is too long, or has such tuples, or a memo with holes.

@@ -25,24 +25,11 @@ from torchrl_priors.artifacts.prior_parts import (
     take_network,
     take_source,
 )
-from torchrl_priors.priors import (
-    AffordancePrior,
-    BoltzmannPrior,
-    MixturePrior,
-    ModulePrior,
-    Prior,
-    UniformPrior,
-)
-
-__all__ = ["build_prior", "describe_prior"]
+from torchrl_priors.priors import AffordancePrior, BoltzmannPrior, MixturePrior, ModulePrior, Prior, UniformPrior
 
 
 def describe_prior(prior: Prior) -> tuple[Parts, dict[str, Tensor]]:
-    """The parts of a prior, for JSON, and its tensors by name.
-
-    Raises:
-        TypeError: a part of the prior is code that no file can hold.
-    """
+    """The parts of a prior, for JSON, and its tensors by name; a part that is code is a ``TypeError``."""
     tensors: dict[str, Tensor] = {}
     parts = _describe(prior, Scope(tensors))
     return parts, {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
@@ -51,11 +38,7 @@ def describe_prior(prior: Prior) -> tuple[Parts, dict[str, Tensor]]:
 def build_prior(
     parts: Any, tensors: dict[str, Tensor], *, in_key: NestedKey | None = None, namespace: NestedKey = "prior"
 ) -> Prior:
-    """The prior of a file, from all of its tensors.
-
-    Raises:
-        ArtifactError: the tensors are not those of its description.
-    """
+    """The prior of a file, from its description and all of its tensors."""
     left = dict(tensors)
     try:
         prior = _build(parts, Scope(left), namespace)

@@ -15,21 +15,7 @@ from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 from torchrl_priors.artifacts.errors import ArtifactError, short
 from torchrl_priors.artifacts.network import build_network, describe_network
 from torchrl_priors.priors import Prior
-from torchrl_priors.priors.mixture import FixedWeights
-from torchrl_priors.state_table import StateTable
-
-__all__ = [
-    "Parts",
-    "Scope",
-    "find_distribution",
-    "keys_from_json",
-    "keys_to_json",
-    "name_distribution",
-    "put_network",
-    "put_source",
-    "take_network",
-    "take_source",
-]
+from torchrl_priors.state_table import Constant, StateTable
 
 Parts = dict[str, Any]
 _DISTRIBUTIONS: dict[str, Any] = {
@@ -43,9 +29,7 @@ _DISTRIBUTIONS: dict[str, Any] = {
 class Scope:
     """The tensors of one part of a prior, whose names in the file begin with the part's.
 
-    Args:
-        tensors (dict): all of a file, by name: filled to write it, emptied to read it.
-        prefix (str): the part's.
+    It fills the dictionary of all tensors of a file to write it, and empties it to read it.
     """
 
     def __init__(self, tensors: dict[str, Tensor], prefix: str = "prior.") -> None:
@@ -82,11 +66,7 @@ class Scope:
 
 
 def put_network(network: Any, scope: Scope) -> Parts:
-    """Describes a network, and puts its tensors.
-
-    Raises:
-        TypeError: it is code.
-    """
+    """Describes a network, and puts its tensors."""
     if not isinstance(network, nn.Module):
         raise TypeError(f"A file can't hold code, such as the function {network!r}.")
     scope.inside("network").put(network.state_dict())
@@ -100,15 +80,11 @@ def take_network(parts: Any, scope: Scope) -> nn.Module:
 
 
 def put_source(source: TensorDictModuleBase, scope: Scope) -> Parts:
-    """Describes a table or a network, and puts its tensors.
-
-    Raises:
-        TypeError: it is code.
-    """
+    """Describes a table or a network, and puts its tensors."""
     if type(source) is TensorDictModule:
         return {"network": put_network(source.module, scope), "in_keys": keys_to_json(source.in_keys)}
-    if type(source) in (StateTable, FixedWeights):
-        scope.put({"table": source.table if isinstance(source, StateTable) else source.values})
+    if type(source) in (StateTable, Constant):
+        scope.put({"table": source.table if isinstance(source, StateTable) else source.weights})
         return {"in_keys": keys_to_json(source.in_keys)}
     raise TypeError(f"A file can hold tables and plain networks by state, and no code of others: no {source}.")
 
@@ -123,16 +99,12 @@ def take_source(parts: Any, scope: Scope) -> tuple[Tensor | nn.Module, list[Nest
 
 
 def name_distribution(prior: Prior) -> str:
-    """What a file calls the distribution of a prior.
-
-    Raises:
-        TypeError: it is not one that a file can hold.
-    """
-    kind = prior.distribution_class
+    """What a file calls the distribution of a prior."""
     for name, known in _DISTRIBUTIONS.items():
-        if kind is known:
+        if prior.distribution_class is known:
             return name
-    raise TypeError(f"A file can hold distributions of kind {', '.join(_DISTRIBUTIONS)}, got {kind}.")
+    kinds = ", ".join(_DISTRIBUTIONS)
+    raise TypeError(f"A file can hold distributions of kind {kinds}, got {prior.distribution_class}.")
 
 
 def find_distribution(name: Any) -> Any:

@@ -14,15 +14,14 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.modules import OneHotCategorical, TanhNormal
 
-from torchrl_priors.artifacts.errors import ArtifactError, short
+from torchrl_priors.artifacts.errors import ArtifactError, refusing, short
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
 from torchrl_priors.artifacts.sb3_network import Family, action_bounds, build_layers, find_family
 from torchrl_priors.artifacts.spaces import check_spaces
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors import BoltzmannPrior, ModulePrior
 
-__all__ = ["load_sb3_prior"]
-
+_PURPOSE = "a Stable-Baselines3 policy"
 _Output: TypeAlias = Literal["logits", "mean", "mean_std"]
 _POLICIES = re.compile(
     r"stable_baselines3\.(common|ppo|a2c|sac|td3|dqn)\.policies|sb3_contrib\.(tqc|trpo|qrdqn)\.policies"
@@ -102,7 +101,7 @@ def load_sb3_prior(
             than the actions, ``one_hot`` with continuous ones, ``temperature`` without action values, or an activation
             that the policy does not have.
     """
-    try:
+    with refusing(path, _PURPOSE):
         checkpoint = read_checkpoint(Path(path))
         _check(checkpoint)
         if checkpoint.use_sde and std is None:
@@ -110,8 +109,6 @@ def load_sb3_prior(
                 "it explores by state-dependent noise (use_sde=True): pass std, the spread around its deterministic"
                 " action in the unit of the action"
             )
-    except ArtifactError as error:
-        raise _refused(path, error) from error
     family = find_family(checkpoint)
     discrete = checkpoint.action_space.kind == "Discrete"
     _check_arguments(path, checkpoint, family, std=std, temperature=temperature, one_hot=one_hot)
@@ -130,7 +127,7 @@ def load_sb3_prior(
     kwargs: dict[str, Any] = {"in_keys": [in_key], "namespace": namespace}
     if one_hot:
         kwargs["distribution_class"] = OneHotCategorical
-    try:
+    with refusing(path, _PURPOSE):
         kind = _activation(checkpoint, "tanh" if family == "on_policy" else "relu", activation)
         network = build_layers(checkpoint, statistics, kind, deterministic=std is not None, clip_mean=clip_mean)
         if family == "squashed" and std is None:
@@ -144,13 +141,7 @@ def load_sb3_prior(
             prior = ModulePrior(network, output, std=std, **kwargs)
         if action_spec is not None:
             check_spaces(prior, checkpoint.observation_space.shape, action_spec)
-    except ArtifactError as error:
-        raise _refused(path, error) from error
     return prior.to(device)
-
-
-def _refused(path: str | os.PathLike[str], error: ArtifactError) -> ArtifactError:
-    return ArtifactError(f"{path} can't be used as a Stable-Baselines3 policy: {error}.")
 
 
 def _check(checkpoint: Checkpoint) -> None:

@@ -16,12 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_priors.artifacts.errors import ArtifactError, InertPickleError, short
+from torchrl_priors.artifacts.errors import ArtifactError, InertPickleError, refusing, short
 from torchrl_priors.artifacts.inert_pickle import MAX_BYTES, StandIn, read_pickle
 from torchrl_priors.artifacts.legacy_torch import LEGACY_START, read_legacy
 from torchrl_priors.artifacts.pickle_program import check_program
-
-__all__ = ["Checkpoint", "Space", "Statistics", "read_checkpoint", "read_vecnormalize"]
 
 _MAX_WEIGHTS = 1 << 30  # bytes, unpacked; of all else, MAX_BYTES
 _OLDER = re.compile(rb"stable_baselines\.\w")
@@ -77,12 +75,7 @@ class Statistics:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Reads a model that Stable-Baselines3's ``model.save`` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ArtifactError: it is not one, or is damaged.
-    """
+    """Reads a model that Stable-Baselines3's ``model.save`` wrote."""
     if not path.is_file():
         raise FileNotFoundError(f"No Stable-Baselines3 model at {path}.")
     try:
@@ -192,15 +185,10 @@ def as_space(found: Any, name: str) -> Space:
 
 
 def read_vecnormalize(path: Path) -> Statistics | None:
-    """Reads what Stable-Baselines3's ``VecNormalize.save`` wrote; ``None`` if it leaves observations as they are.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ArtifactError: it is not one, names something that is not expected, or normalises dictionaries.
-    """
+    """Reads what Stable-Baselines3's ``VecNormalize.save`` wrote; ``None`` if it leaves observations as they are."""
     if not path.is_file():
         raise FileNotFoundError(f"No VecNormalize statistics at {path}.")
-    try:
+    with refusing(path, "VecNormalize statistics"):
         if (size := path.stat().st_size) > MAX_BYTES:
             raise ArtifactError(f"it has {size} bytes, expected at most {MAX_BYTES}")
         data = path.read_bytes()
@@ -224,7 +212,5 @@ def read_vecnormalize(path: Path) -> Statistics | None:
         for name, value in (("epsilon", epsilon), ("clip_obs", clip)):
             if not isinstance(value, (int, float)) or not 0 < value <= sys.float_info.max:
                 raise ArtifactError(f"its {name} must be a positive number, got {short(value)}")
-    except ArtifactError as error:
-        raise ArtifactError(f"{path} can't be used as VecNormalize statistics: {error}.") from error
     as_tensor = torch.as_tensor
     return Statistics(as_tensor(mean).double(), as_tensor(var).double(), float(epsilon), float(clip))  # type: ignore[arg-type]

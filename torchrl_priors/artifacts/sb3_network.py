@@ -19,8 +19,6 @@ from torchrl_priors.priors.layers import (
     TeacherInput,
 )
 
-__all__ = ["Family", "action_bounds", "build_layers", "find_family"]
-
 Family = Literal["on_policy", "squashed", "deterministic", "values"]
 
 
@@ -44,18 +42,7 @@ def build_layers(
 ) -> nn.Sequential:
     """From raw observations to logits, action values, a mean, or a mean and a standard deviation.
 
-    Args:
-        checkpoint (Checkpoint): of a policy that :func:`find_family` knows.
-        statistics (Statistics, optional): what its observations were normalised by.
-        activation (type): of its hidden layers.
-
-    Keyword Args:
-        deterministic (bool): whether a policy over continuous actions gives its deterministic action, in the unit of
-            the environment.
-        clip_mean (bool): whether an on-policy one keeps its mean within the bounds.
-
-    Raises:
-        ArtifactError: the weights are not those of such a policy, or are not finite.
+    With ``deterministic`` continuous actions are in the unit of the environment; ``clip_mean`` is for an on-policy one.
     """
     family, parts = find_family(checkpoint), _Parts(checkpoint.weights)
     if family == "values":
@@ -80,11 +67,7 @@ def build_layers(
 
 
 def action_bounds(checkpoint: Checkpoint) -> tuple[Tensor, Tensor]:
-    """The bounds of the actions, which a squashed policy needs.
-
-    Raises:
-        ArtifactError: there is none, or they are in the wrong order.
-    """
+    """The bounds of the actions, which a squashed policy needs."""
     space = checkpoint.action_space
     low, high = (torch.as_tensor(bound).float() for bound in (space.low, space.high))
     if not (low.isfinite().all() and high.isfinite().all() and (low < high).all()):

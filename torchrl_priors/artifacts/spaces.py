@@ -17,22 +17,13 @@ from torchrl_priors.distributions import TORCHRL_ONE_HOT, BoxUniform, action_sha
 from torchrl_priors.priors import Prior
 from torchrl_priors.priors.layers import ClipToBox, ScaleToBox
 
-__all__ = ["check_spaces"]
-
 Spec: TypeAlias = TensorSpec | Sequence[int] | int
 
 
 def check_spaces(prior: Prior, observation_spec: Spec, action_spec: Spec | None = None) -> None:
     """Asks a prior about one observation, and holds its distribution against the actions.
 
-    Args:
-        prior (Prior): reads one key at most.
-        observation_spec (TensorSpec, sequence of int or int): the observations, or the shape of one.
-        action_spec (TensorSpec, sequence of int or int, optional): the actions, the shape of one, or their number.
-
-    Raises:
-        ArtifactError: it can't read the observations, or advises on other actions or within other bounds.
-        TypeError: a spec is one of several entries.
+    Instead of a spec the shape of an observation will do, and that of an action or the number of actions.
     """
     for spec in (observation_spec, action_spec):
         if isinstance(spec, Composite):

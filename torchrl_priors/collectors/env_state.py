@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import mujoco
     from gymnasium.vector import VectorEnv
 
-__all__ = ["env_state_dict", "load_env_state_dict"]
-
 
 def env_state_dict(env: VectorEnv) -> dict[str, Any]:
     """The state of each environment of a vector, exact to the bit.
@@ -87,12 +85,16 @@ def _sub_envs(env: VectorEnv) -> list[gymnasium.Env]:
     return list(env.envs)
 
 
-def _layers(env: gymnasium.Env) -> Iterator[gymnasium.Env]:
-    """The wrappers of an environment, from the outside, and the environment itself."""
+def wrappers(env: gymnasium.Env) -> Iterator[Any]:
+    """The wrappers of an environment, from the outside."""
     while env is not env.unwrapped:
         yield env
         env = env.env
-    yield env
+
+
+def _layers(env: gymnasium.Env) -> list[Any]:
+    """The wrappers of an environment, and the environment itself."""
+    return [*wrappers(env), env.unwrapped]
 
 
 def _identity(env: gymnasium.Env) -> dict[str, Any]:

@@ -17,8 +17,6 @@ from torchrl_priors.collectors.vector_env import check_vector_env, spread_seed
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
-__all__ = ["Evaluation", "evaluate"]
-
 
 class Evaluation(NamedTuple):
     """What :func:`evaluate` returns."""
@@ -58,13 +56,7 @@ def evaluate(
         normalizer (RunningNorm, optional): applied as it is, frozen or not; never updated.
         seed (int, optional): the same gives the same returns. Defaults to None: by the operating system.
         deterministic (bool): the policy's deterministic action instead of a sample. Defaults to False.
-        observation_key (NestedKey): defaults to ``"observation"``.
-        action_key (NestedKey): defaults to ``"action"``.
-        normalized_key (NestedKey): defaults to ``"observation_norm"``.
-        device (torch.device): the device of the policy. Defaults to ``"cpu"``.
-
-    Returns:
-        Evaluation: ``returns`` and ``lengths``.
+        observation_key, action_key, normalized_key, device: see :class:`VectorCollector`.
 
     Raises:
         ValueError: if ``episodes`` is below 1, or see :class:`VectorCollector`.

@@ -13,23 +13,9 @@ from torch import nn
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
-__all__ = ["CollectorInterface"]
-
 
 class CollectorInterface(ABC):
-    """Iteration, the number of batches, weights and the end, with the names and arguments of TorchRL's collectors.
-
-    Args:
-        env (VectorEnv): closed at the end.
-        policy (TensorDictModuleBase): used where it is.
-
-    Keyword Args:
-        frames_per_batch (int): a multiple of the number of environments.
-        total_frames (int): a multiple of ``frames_per_batch``, or -1.
-
-    Raises:
-        ValueError: numbers of frames that do not divide.
-    """
+    """Iteration, the number of batches, weights and the end, with the names and arguments of TorchRL's collectors."""
 
     init_random_frames = 0
     """None: the policy acts from the first step on."""
@@ -75,11 +61,7 @@ class CollectorInterface(ABC):
         return self.rollout() if self.total_frames == -1 or self.frames < self.total_frames else None
 
     def __len__(self) -> int:
-        """The number of rollouts in ``total_frames``.
-
-        Raises:
-            RuntimeError: there is no end.
-        """
+        """The number of rollouts in ``total_frames``."""
         if self.total_frames == -1:
             raise RuntimeError("A collector without total_frames has no length.")
         return self.total_frames // self.frames_per_batch
@@ -137,24 +119,14 @@ class CollectorInterface(ABC):
             raise TypeError(f"Expected a policy, a tensordict or a state_dict of weights, got {type(value).__name__}.")
 
     def start(self) -> None:
-        """Refuses to collect in the background.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Refuses to collect in the background."""
         raise NotImplementedError(
             f"A {type(self).__name__} collects when it is iterated over, and not in the background: pass"
             " async_collection=False to the trainer, or use a collector of TorchRL."
         )
 
     def shutdown(self, timeout: float | None = None, close_env: bool = True, raise_on_error: bool = True) -> None:
-        """Closes the environments, once.
-
-        Args:
-            timeout (float, optional): of no effect, as there is nothing to wait for.
-            close_env (bool): defaults to ``True``.
-            raise_on_error (bool): whether an error of the environments is raised. Defaults to ``True``.
-        """
+        """Closes the environments, once; there is nothing to wait for, so that ``timeout`` has no effect."""
         if not close_env:
             return
         try:

@@ -11,8 +11,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-__all__ = ["READ", "TASKS", "Task"]
-
 READ = ("qpos", "qvel", "ctrl", "xpos", "xipos", "cinert", "cvel", "cfrc_ext", "qfrc_actuator")
 """What the formulas read of the simulator's data."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any
 
@@ -11,9 +11,8 @@ from gymnasium import Env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
+from torchrl_priors.collectors.env_state import wrappers
 from torchrl_priors.collectors.mujoco_tasks import READ, TASKS, Task
-
-__all__ = ["MujocoVectorEnv"]
 
 _CHECKED_STEPS = 2  # those in which Gymnasium's passive checker looks at what it is given
 
@@ -30,9 +29,6 @@ class MujocoVectorEnv(SyncVectorEnv):
     arguments, under the wrappers of :func:`gymnasium.make`; see :attr:`fast`. All else is the superclass's: resets,
     spaces, ``envs``, and the steps of any other environments, e.g. of a subclass or under another wrapper. They are
     also the superclass's after :meth:`set_attr`, or if the first two give other numbers than the formulas known here.
-
-    Args:
-        env_fns (sequence of callables): make the environments.
     """
 
     _observations: np.ndarray
@@ -45,7 +41,7 @@ class MujocoVectorEnv(SyncVectorEnv):
         self._limits: list[tuple[int, Any]] = [
             (number, layer)
             for number, env in enumerate(self.envs)
-            for layer in _layers(env)
+            for layer in wrappers(env)
             if isinstance(layer, TimeLimit)
         ]
 
@@ -113,7 +109,7 @@ def _find_task(envs: Sequence[Env]) -> Task | None:
     bases: list[Any] = [env.unwrapped for env in envs]
     kinds = {f"{type(base).__module__}.{type(base).__qualname__}" for base in bases}
     plain = (TimeLimit, OrderEnforcing, PassiveEnvChecker)
-    if len(kinds) > 1 or not all(type(layer) in plain for env in envs for layer in _layers(env)):
+    if len(kinds) > 1 or not all(type(layer) in plain for env in envs for layer in wrappers(env)):
         return None
     make = TASKS.get(kinds.pop())
     if make is None or any(base.render_mode == "human" for base in bases):
@@ -122,13 +118,6 @@ def _find_task(envs: Sequence[Env]) -> Task | None:
         return make(bases) if all(_settings(base) == _settings(bases[0]) for base in bases) else None
     except _UNEXPECTED:
         return None
-
-
-def _layers(env: Env) -> Iterator[Any]:
-    """The wrappers of an environment, from the outside."""
-    while env is not env.unwrapped:
-        yield env
-        env = env.env
 
 
 def _settings(base: Any) -> dict[str, Any]:

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-__all__ = ["RunningNorm"]
-
 
 class RunningNorm(nn.Module):
     """Normalises by the mean and standard deviation of all data seen so far: (x - mean) / sqrt(var + eps), clipped.
@@ -65,10 +63,7 @@ class RunningNorm(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Takes data into the statistics.
-
-        Args:
-            x (Tensor): ``[*B, *shape]``, of any leading dimensions.
+        """Takes data ``[*B, *shape]`` into the statistics.
 
         Raises:
             RuntimeError: if the statistics are frozen.
@@ -96,13 +91,7 @@ class RunningNorm(nn.Module):
         return self.mean.to(torch.float32), (self.var + self.eps).rsqrt().to(torch.float32)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalises.
-
-        Args:
-            x (Tensor): ``[*B, *shape]``.
-
-        Returns:
-            Tensor: float32, ``[*B, *shape]``, in ``[-clip, clip]``.
+        """Normalises ``[*B, *shape]`` to float32 in ``[-clip, clip]``.
 
         Raises:
             ValueError: the trailing dimensions are not ``shape``; they are never broadcast.

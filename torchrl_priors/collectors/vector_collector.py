@@ -20,8 +20,6 @@ from torchrl_priors.collectors.vector_env import check_vector_env, spread_seed
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
 
-__all__ = ["VectorCollector"]
-
 
 class VectorCollector(CollectorInterface):
     """Iterates over rollouts ``[num_envs, T]`` of a policy in a vector of Gymnasium environments.
@@ -121,14 +119,11 @@ class VectorCollector(CollectorInterface):
         self.set_seed(seed)
 
     def set_seed(self, seed: int | None, static_seed: bool = False) -> int:
-        """Seeds environments and actions, and begins new episodes.
+        """Seeds environments and actions, and begins new episodes; a seed for whatever is seeded next.
 
         Args:
             seed (int, optional): ``None`` for one of the operating system's.
             static_seed (bool): whether the same seed is returned, not the next one. Defaults to ``False``.
-
-        Returns:
-            int: a seed for whatever is seeded next.
         """
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
@@ -274,11 +269,10 @@ class VectorCollector(CollectorInterface):
         return batch
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next rollout depends on, but for the policy: environments, random numbers, normaliser, counters.
+        """All that the next rollout depends on but the policy, as tensors, numbers and strings in nested dicts.
 
-        Tensors, numbers and strings only, in nested dicts, for :func:`torch.save` (with ``weights_only``) and
-        ``torchrl.checkpoint``. Take it between rollouts. A collector that loads it, in this process or another,
-        continues bit by bit, given the same policy, machine and versions.
+        Take it between rollouts. A collector that loads it, in this process or another, continues bit by bit, given the
+        same policy, machine and versions.
 
         Raises:
             TypeError: the state of an environment cannot be saved, see :func:`env_state_dict`.

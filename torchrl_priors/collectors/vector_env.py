@@ -12,8 +12,6 @@ import numpy as np
 if TYPE_CHECKING:
     from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-__all__ = ["check_vector_env", "make_vector_env", "spread_seed"]
-
 
 def make_vector_env(env_id: str, num_envs: int, **kwargs: Any) -> SyncVectorEnv:
     """A :class:`gymnasium.vector.SyncVectorEnv` that does not reset by itself: its last observations are the true ones.
@@ -69,12 +67,7 @@ def _quiet_mujoco() -> Iterator[None]:
 
 
 def check_vector_env(env: VectorEnv) -> None:
-    """Raises if the collector cannot run an environment.
-
-    Raises:
-        ValueError: if it resets by itself.
-        TypeError: if its observations or actions are not arrays of real numbers.
-    """
+    """Refuses an environment that resets by itself, or whose observations or actions are no arrays of real numbers."""
     mode = env.metadata.get("autoreset_mode")
     if getattr(mode, "name", mode) != "DISABLED":
         raise ValueError(
@@ -87,14 +80,9 @@ def check_vector_env(env: VectorEnv) -> None:
 
 
 def spread_seed(seed: int | None, num_envs: int, stream: int) -> tuple[list[int], int]:
-    """Independent seeds of the sub-environments and of the actions, from one.
+    """Independent seeds of the sub-environments and of the actions, from one, or from the operating system.
 
     Gymnasium's own rule, seed + i, gives sub-environment 1 of seed 0 the numbers of sub-environment 0 of seed 1.
-
-    Args:
-        seed (int or None): at least 0; None draws one from the operating system.
-        num_envs (int): number of sub-environments.
-        stream (int): another stream gives other seeds.
 
     Examples:
         >>> spread_seed(0, 2, stream=0) == spread_seed(0, 2, stream=0)

@@ -8,11 +8,4 @@ from .compiled_step import CompiledStep
 from .multi_teacher import MultiTeacherLoss
 from .ppo import ClipPPOPriorLoss
 
-__all__ = [
-    "AE2RLoss",
-    "AVECMixin",
-    "ClipPPOPriorLoss",
-    "CompiledStep",
-    "MultiTeacherLoss",
-    "ValueOffset",
-]
+__all__ = ["AE2RLoss", "AVECMixin", "ClipPPOPriorLoss", "CompiledStep", "MultiTeacherLoss", "ValueOffset"]

@@ -17,16 +17,14 @@ from tensordict.utils import NestedKey
 from torch import distributions as d
 from torch.compiler import is_compiling
 
-from torchrl_priors.keys import check_option, out_key, under_next
+from torchrl_priors.keys import check_option, out_key, under_next, warn_of_another_teacher
 from torchrl_priors.methods import MethodSpec, get_method
-from torchrl_priors.priors import Prior, warn_of_another_teacher
+from torchrl_priors.priors import Prior
 
 from .networks_loss import NetworksLoss
 from .selected import SelectedOutput
 from .terms import AuxiliaryTerm, Found, RawCriticTerm, Term, WeightTerm
 from .wiring import Wiring, check_teacher
-
-__all__ = ["AE2RLoss"]
 
 #: The losses, each with its coefficient, and what is logged, in the order of the output.
 _LOSSES = {"loss_prior_critic": "critic_coeff", "loss_prior_weight": "weight_coeff", "loss_prior": "aux_coeff"}
@@ -133,7 +131,6 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_prior', 'loss_prior_critic', 'loss_prior_weight']
         >>> sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-
     """
 
     @dataclass

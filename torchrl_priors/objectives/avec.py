@@ -9,8 +9,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-__all__ = ["AVECMixin", "ValueOffset"]
-
 
 class ValueOffset(nn.Module):
     """Adds a constant to a value: the last layer of a critic that is trained by :class:`AVECMixin`.
@@ -24,7 +22,6 @@ class ValueOffset(nn.Module):
         >>> critic = nn.Sequential(nn.Linear(3, 1), ValueOffset())
         >>> critic(torch.zeros(5, 3)).shape
         torch.Size([5, 1])
-
     """
 
     def __init__(self, init: float = 0.0) -> None:
@@ -97,7 +94,6 @@ class AVECMixin:
         >>> error = critic(data.clone())["state_value"] - data["value_target"]
         >>> bool(error.mean().abs() < 1e-6)
         True
-
     """
 
     _steps: TensorDictBase | None = None  # those of the minibatch, during a forward pass

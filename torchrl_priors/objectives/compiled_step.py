@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from .flat_adam import FlatParameters, adam, clip
 from .recorded import layout_of, record, replaced, tensors_of
 
-__all__ = ["CompiledStep"]
-
 
 class CompiledStep:
     r"""Steps of Adam on minibatches, each one compiled graph: index, losses, gradients, clipping and update at once.
@@ -75,7 +73,6 @@ class CompiledStep:
         >>> reports = step(batch, torch.randperm(64).split(16))
         >>> reports.shape == (4, len(step.names)), "loss_critic" in step.names
         (True, True)
-
     """
 
     names: list[str]
@@ -113,8 +110,7 @@ class CompiledStep:
         """Take a step on ``batch[index]`` for each of the indices, in turn.
 
         Args:
-            batch (TensorDictBase): ``[N]``, or ``[N, T]`` of which sequences are taken, with the entries that the
-                loss reads and few others.
+            batch (TensorDictBase): ``[N]``, or ``[N, T]`` of sequences, with what the loss reads and little else.
             indices (iterable of Tensor): integers, ``[M]`` each. Each length is recorded and compiled apart.
 
         Returns:

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["FlatParameters", "adam", "clip"]
-
 
 class FlatParameters:
     """Parameters of one group at one step of Adam, and their state, end to end: few large operations, not many small.

@@ -19,8 +19,6 @@ from torchrl_priors.priors import Prior
 from .ae2r import AE2RLoss
 from .selected import SelectedOutput
 
-__all__ = ["MultiTeacherLoss"]
-
 
 class MultiTeacherLoss(SelectedOutput, LossModule):
     r"""An :class:`AE2RLoss` for each of several teachers, with one prior weight :math:`\omega_k(s)` per teacher.

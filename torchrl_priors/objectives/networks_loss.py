@@ -9,8 +9,6 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-__all__ = ["NetworksLoss"]
-
 
 class NetworksLoss(LossModule):
     """Keeps networks by name, each with its parameters under ``name_params``, as TorchRL's losses do.

@@ -18,8 +18,6 @@ from .ae2r import AE2RLoss
 from .multi_teacher import MultiTeacherLoss
 from .selected import SelectedOutput
 
-__all__ = ["ClipPPOPriorLoss"]
-
 
 class ClipPPOPriorLoss(SelectedOutput, ClipPPOLoss):
     r"""Clipped PPO towards soft action priors: :class:`~torchrl.objectives.ClipPPOLoss` and :class:`AE2RLoss` in one.
@@ -77,7 +75,6 @@ class ClipPPOPriorLoss(SelectedOutput, ClipPPOLoss):
         >>> sorted(key for key in losses.keys() if key.startswith("loss_"))
         ['loss_critic', 'loss_objective', 'loss_prior']
         >>> sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-
     """
 
     @dataclass

@@ -16,8 +16,6 @@ from torch.fx import GraphModule
 from torch.fx.experimental.proxy_tensor import disable_proxy_modes_tracing, make_fx
 from torch.overrides import TorchFunctionMode
 
-__all__ = ["layout_of", "record", "replaced", "tensors_of"]
-
 
 def record(step: Callable[..., Tensor], inputs: list[Tensor], backend: str) -> Callable[[list[Tensor]], Tensor]:
     """Runs a step once, on copies of its inputs, and compiles what happened, or replays it (``"eager"``)."""

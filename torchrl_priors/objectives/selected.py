@@ -7,8 +7,6 @@ from typing import Any
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 
-__all__ = ["SelectedOutput"]
-
 
 class SelectedOutput:
     """``select_out_keys`` of a loss that reads some entries only if they are there.

@@ -12,15 +12,12 @@ from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_priors.advice import check_advice
 from torchrl_priors.distributions import cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
 from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
-from torchrl_priors.keys import next_step, read, under_next
+from torchrl_priors.keys import check_advice, next_step, read, under_next
 
 if TYPE_CHECKING:
     from torchrl_priors.objectives.ae2r import AE2RLoss
-
-__all__ = ["AuxiliaryTerm", "RawCriticTerm", "Term", "WeightTerm"]
 
 #: What the terms found so far at each step, ``[*B, 1]``, by name: a later term reads what an earlier one wrote.
 Found = dict[str, Tensor]

@@ -14,8 +14,6 @@ from torchrl_priors.keys import under_next
 if TYPE_CHECKING:
     from torchrl_priors.objectives.ae2r import AE2RLoss
 
-__all__ = ["Wiring", "check_teacher"]
-
 
 class Wiring:
     """Warns, once for each, of a bonus of another method, and of an advantage that has not seen the bonus.

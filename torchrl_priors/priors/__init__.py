@@ -4,7 +4,6 @@ from torchrl_priors.priors.action_prior import ActionPrior
 from torchrl_priors.priors.affordance import AffordancePrior
 from torchrl_priors.priors.boltzmann import BoltzmannPrior
 from torchrl_priors.priors.callable import CallablePrior
-from torchrl_priors.priors.loading import warn_of_another_teacher
 from torchrl_priors.priors.mixture import MixturePrior
 from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.policy import policy_prior
@@ -23,5 +22,4 @@ __all__ = [
     "RescaledPrior",
     "UniformPrior",
     "policy_prior",
-    "warn_of_another_teacher",
 ]

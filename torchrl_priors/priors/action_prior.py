@@ -21,12 +21,10 @@ from torch import distributions as d
 from torch.compiler import is_compiling
 from torchrl.modules import Delta, TanhDelta
 
-from torchrl_priors.advice import parameter_fault
 from torchrl_priors.distributions import without_independent
+from torchrl_priors.keys import parameter_fault
 from torchrl_priors.priors.memory import refuse_hidden_states, without_memory
 from torchrl_priors.priors.prior import Prior
-
-__all__ = ["ActionPrior", "policy_of"]
 
 
 class ActionPrior(Prior):

@@ -13,8 +13,6 @@ from torchrl_priors.priors.action_prior import ActionPrior, policy_of
 from torchrl_priors.priors.spread import check_epsilon, smoothed_logits
 from torchrl_priors.state_table import by_state
 
-__all__ = ["AffordancePrior"]
-
 
 class AffordancePrior(ActionPrior):
     r"""Affordances: which discrete actions make sense in a state, or how much, as a distribution over them.

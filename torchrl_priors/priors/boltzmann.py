@@ -13,8 +13,6 @@ from torch import distributions as d
 from torchrl_priors.priors.action_prior import ActionPrior, policy_of
 from torchrl_priors.state_table import by_state
 
-__all__ = ["BoltzmannPrior"]
-
 
 class BoltzmannPrior(ActionPrior):
     r"""A softmax over action values, :math:`\pi_0(a|s) \propto \exp(Q(s,a)/\tau)`.

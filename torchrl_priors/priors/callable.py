@@ -15,8 +15,6 @@ from torch import distributions as d
 from torchrl_priors.priors.module import ModulePrior
 from torchrl_priors.priors.spread import as_std, check_epsilon, smoothed_logits
 
-__all__ = ["CallablePrior"]
-
 
 class CallablePrior(ModulePrior):
     r"""A Gymnasium-style controller, ``action = policy(observation)`` on NumPy arrays, with a spread around its action.

@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 from torch.compiler import is_compiling
 
-__all__ = ["ClipToBox", "GaussianHead", "NatureCNN", "ScaleToBox", "StateIndependentStd", "TeacherInput"]
-
 
 class TeacherInput(nn.Module):
     r"""From raw observations to what a teacher's network reads.
@@ -22,13 +20,6 @@ class TeacherInput(nn.Module):
 
     Keyword Args:
         statistics (tuple of Tensor, optional): mean and variance, each of ``shape``. Defaults to ``None``: raw.
-        eps (float): added to the variance. Defaults to 1e-8.
-        clip (float): bound of what is normalised. Defaults to 10.
-        pixels (bool): whether observations are divided by 255. Defaults to ``False``.
-        flatten (bool): whether an observation becomes a vector. Defaults to ``True``.
-
-    Raises:
-        ValueError: statistics of another shape; at call, observations of another shape.
 
     Examples:
         >>> import torch
@@ -98,11 +89,7 @@ def _check_pixels(observation: Tensor) -> None:
 
 
 class StateIndependentStd(nn.Module):
-    """A standard deviation that is the same in every state, from a mean ``[*B, A]`` to mean and std ``[*B, A]``.
-
-    Args:
-        log_std (Tensor): its logarithm, ``[A]``.
-    """
+    """A standard deviation that is the same in every state, from a mean ``[*B, A]`` to mean and std ``[*B, A]``."""
 
     def __init__(self, log_std: Tensor) -> None:
         super().__init__()
@@ -114,14 +101,7 @@ class StateIndependentStd(nn.Module):
 
 
 class GaussianHead(nn.Module):
-    """Mean and standard deviation ``[*B, A]`` from features ``[*B, F]``, its logarithm clamped.
-
-    Args:
-        features, act_dim (int): F and A.
-
-    Keyword Args:
-        log_std_range (tuple of float): where the logarithm is clamped. Defaults to ``(-20, 2)``, as in SAC.
-    """
+    """Mean and standard deviation ``[*B, A]`` from features ``[*B, F]``, its logarithm clamped as in SAC."""
 
     def __init__(self, features: int, act_dim: int, *, log_std_range: tuple[float, float] = (-20.0, 2.0)) -> None:
         super().__init__()
@@ -136,11 +116,7 @@ class GaussianHead(nn.Module):
 
 
 class ScaleToBox(nn.Module):
-    """Actions from [-1, 1] to the bounds of a box, in the unit of the environment.
-
-    Args:
-        low, high (Tensor): the bounds, ``[A]``.
-    """
+    """Actions from [-1, 1] to the bounds ``[A]`` of a box, in the unit of the environment."""
 
     low: Tensor
     high: Tensor
@@ -156,10 +132,7 @@ class ScaleToBox(nn.Module):
 
 
 class ClipToBox(nn.Module):
-    """Clips actions to the bounds of a box.
-
-    Args:
-        low, high (Tensor): the bounds, ``[A]``; infinite where there is none, which is kept as the largest number.
+    """Clips actions to the bounds ``[A]`` of a box; an infinite one is kept as the largest number.
 
     Examples:
         >>> import torch
@@ -181,12 +154,7 @@ class ClipToBox(nn.Module):
 
 
 class NatureCNN(nn.Module):
-    """The convolutions of Mnih et al., "Human-level control through deep reinforcement learning" (2015).
-
-    Args:
-        shape (sequence of int): channels, height and width of an image.
-        features (int): what it gives. Defaults to 512.
-    """
+    """The convolutions of Mnih et al., "Human-level control through deep reinforcement learning" (2015)."""
 
     def __init__(self, shape: Sequence[int], features: int = 512) -> None:
         super().__init__()

@@ -10,8 +10,6 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import nn
 
-__all__ = ["refuse_hidden_states", "without_memory"]
-
 _WAY = (
     "A prior is asked for its advice on states in any order. Let the teacher step along while the batch is collected,"
     " write the parameters of its distribution, and make a prior that reads them (see the guide to pitfalls)."

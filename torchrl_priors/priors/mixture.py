@@ -15,9 +15,7 @@ from torchrl.modules import IndependentNormal, OneHotCategorical
 
 from torchrl_priors.distributions import CATEGORICAL, TORCHRL_ONE_HOT, action_shape, without_independent
 from torchrl_priors.priors.prior import Prior
-from torchrl_priors.state_table import by_state
-
-__all__ = ["FixedWeights", "MixturePrior"]
+from torchrl_priors.state_table import Constant, by_state
 
 
 class MixturePrior(Prior):
@@ -131,8 +129,7 @@ class MixturePrior(Prior):
         if self.param_names == ["logits"]:
             return self.distribution_class(logits=params["logits"])
         return d.MixtureSameFamily(
-            d.Categorical(logits=params["mixture_logits"]),
-            d.Independent(d.Normal(params["loc"], params["scale"]), 1),
+            d.Categorical(logits=params["mixture_logits"]), d.Independent(d.Normal(params["loc"], params["scale"]), 1)
         )
 
 
@@ -164,25 +161,9 @@ def _weights_module(
     if not table.ndim or table.shape[-1] != number:
         raise ValueError(f"A mixture of {number} priors has a weight for each, got shape {tuple(table.shape)}.")
     _check_weights(table)
-    return FixedWeights(table) if table.ndim == 1 else by_state(table, in_keys, "weights")
+    return Constant({"weights": table}) if table.ndim == 1 else by_state(table, in_keys, "weights")
 
 
 def _check_weights(weights: Tensor) -> None:
     if not (weights.isfinite() & (weights >= 0)).all() or (weights.sum(-1) == 0).any():
         raise ValueError("The weights of a mixture must be finite, not negative, and not all 0 in a state.")
-
-
-class FixedWeights(TensorDictModuleBase):
-    """The same weights in every state."""
-
-    values: Tensor
-
-    def __init__(self, values: Tensor) -> None:
-        super().__init__()
-        self.in_keys: list[NestedKey] = []
-        self.out_keys: list[NestedKey] = ["weights"]
-        self.register_buffer("values", values)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes them at every step."""
-        return tensordict.set("weights", self.values.to(tensordict.device).expand(*tensordict.batch_size, -1))

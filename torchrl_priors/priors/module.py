@@ -18,8 +18,6 @@ from torchrl_priors.distributions import CATEGORICAL, without_independent
 from torchrl_priors.priors.action_prior import ActionPrior, policy_of
 from torchrl_priors.priors.spread import as_std
 
-__all__ = ["ModulePrior"]
-
 _Output = Literal["logits", "probs", "mean", "mean_std", "distribution"]
 
 

@@ -12,8 +12,6 @@ from torchrl_priors.networks import GaussianMLP
 from torchrl_priors.priors.layers import TeacherInput
 from torchrl_priors.priors.module import ModulePrior
 
-__all__ = ["policy_prior"]
-
 
 def policy_prior(
     actor: ProbabilisticActor,

@@ -16,8 +16,6 @@ from torch.compiler import is_compiling
 
 from torchrl_priors.distributions import CATEGORICAL, TORCHRL_ONE_HOT, BoxUniform, action_shape, bounds_of, outside
 
-__all__ = ["NegatedPrior", "Prior", "PriorWrapper"]
-
 
 class Prior(TensorDictModuleBase, ABC):
     r"""A soft action prior :math:`\pi_0(a|s)`: a distribution over actions in every state, as advice to a student.

@@ -13,8 +13,6 @@ from torchrl.modules import TanhNormal
 from torchrl_priors.distributions import without_independent
 from torchrl_priors.priors.prior import Prior, PriorWrapper
 
-__all__ = ["RescaledPrior"]
-
 
 class RescaledPrior(PriorWrapper):
     r"""A Gaussian teacher of actions in ``[low, high]`` for a student of the same actions in ``[to_low, to_high]``.

@@ -7,20 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-__all__ = ["as_std", "check_epsilon", "smoothed_logits"]
-
 
 def smoothed_logits(weights: Tensor, epsilon: float) -> Tensor:
     r"""The log-probabilities :math:`\log[(1-\epsilon)\,w_a/\sum_b w_b + \epsilon/A]`, ``[*B, A]``.
 
     Where all weights are 0, nothing is known, and all actions are equally probable.
-
-    Args:
-        weights (Tensor): ``[*B, A]``, not negative; or bool.
-        epsilon (float): how much probability is spread over all actions, in (0, 1].
-
-    Raises:
-        ValueError: a weight is negative or not finite.
 
     Examples:
         >>> smoothed_logits(torch.tensor([1.0, 0.0, 1.0, 0.0]), 0.2).exp()

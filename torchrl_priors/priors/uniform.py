@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey
 from torch import Tensor
 from torch import distributions as d
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
@@ -15,8 +14,7 @@ from torchrl.modules import OneHotCategorical
 from torchrl_priors.distributions import BoxUniform
 from torchrl_priors.priors.action_prior import ActionPrior, policy_of
 from torchrl_priors.priors.prior import Prior
-
-__all__ = ["UniformPrior"]
+from torchrl_priors.state_table import Constant
 
 
 class UniformPrior(ActionPrior):
@@ -50,29 +48,12 @@ class UniformPrior(ActionPrior):
 
     def __init__(self, actions: TensorSpec | int, *, namespace: NestedKey = "prior") -> None:
         params, distribution_class, kwargs = _uniform(actions)
-        policy = policy_of(_Constant(params), names=list(params), distribution_class=distribution_class, **kwargs)
+        policy = policy_of(Constant(params), names=list(params), distribution_class=distribution_class, **kwargs)
         super().__init__(policy, namespace=namespace)
 
     def adversary(self) -> Prior:
         """The prior itself: no advice has no opposite."""
         return self
-
-
-class _Constant(TensorDictModuleBase):
-    """Writes the same values at every step."""
-
-    def __init__(self, values: dict[str, Tensor]) -> None:
-        super().__init__()
-        self.in_keys: list[NestedKey] = []
-        self.out_keys = list(values)
-        for name, value in values.items():
-            self.register_buffer(name, value)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        for name in self.out_keys:
-            value = getattr(self, name)
-            tensordict.set(name, value.to(tensordict.device).expand(*tensordict.batch_size, *value.shape))
-        return tensordict
 
 
 def _uniform(actions: TensorSpec | int) -> tuple[dict[str, Tensor], Any, dict[str, Any]]:

@@ -8,8 +8,6 @@ from typing import Any, NoReturn
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, Transform
 
-__all__ = ["BatchTransform"]
-
 
 class BatchTransform(Transform):
     """Base of transforms that read and write batches of trajectories ``[*B, T]``, outside of environments.

@@ -12,8 +12,6 @@ from torchrl_priors.keys import under_next
 from torchrl_priors.transforms.prior_bonus import PriorBonus
 from torchrl_priors.transforms.prior_log_prob import PriorLogProb
 
-__all__ = ["prior_transforms"]
-
 
 def prior_transforms(loss: LossModule, **kwargs: Any) -> Compose:
     r"""What a loss needs in its batch: :class:`PriorLogProb` and :class:`PriorBonus` for each of its teachers.

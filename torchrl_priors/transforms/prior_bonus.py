@@ -15,8 +15,6 @@ from torchrl_priors.methods import get_method
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.transforms.batch_transform import BatchTransform
 
-__all__ = ["PriorBonus"]
-
 
 class PriorBonus(BatchTransform):
     r"""Writes the bonus :math:`B_t = \omega(s)\log\pi_0(a|s)` and the shaped reward :math:`R_t + c B_t`.

@@ -11,14 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 
-from torchrl_priors.advice import check_advice
 from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
-from torchrl_priors.keys import check_option, next_step, read, under_next
-from torchrl_priors.priors import Prior, warn_of_another_teacher
+from torchrl_priors.keys import check_advice, check_option, next_step, read, under_next, warn_of_another_teacher
+from torchrl_priors.priors import Prior
 from torchrl_priors.transforms.batch_transform import BatchTransform
-
-__all__ = ["PriorLogProb"]
 
 
 class PriorLogProb(BatchTransform):
@@ -195,11 +192,9 @@ class PriorLogProb(BatchTransform):
             here, after = tensordict.get(key, None), tensordict.get(under_next(key), None)
             if here is None or after is None or here.shape != after.shape or not follows.any():
                 continue
-            same = (
-                (here.roll(-1, time_dim) == after).flatten(follows.ndim).all(-1)
-                if here.ndim > follows.ndim
-                else (here.roll(-1, time_dim) == after)
-            )
+            same = here.roll(-1, time_dim) == after
+            if same.ndim > follows.ndim:
+                same = same.flatten(follows.ndim).all(-1)
             if not same[follows].any():
                 warnings.warn(
                     f"No step of the batch goes on where its next one begins: {key!r} of step t + 1 is never"
