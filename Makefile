@@ -11,7 +11,7 @@ setup:  ## create .venv with everything a contributor needs
 check:  ## formatting, lint and types; changes nothing
 	$(BIN)ruff format --check .
 	$(BIN)ruff check .
-	$(BIN)mypy torchrl_priors recipes
+	$(BIN)mypy torchrl_priors recipes hydra_plugins
 
 format:  ## apply the formatting and the safe lint fixes
 	$(BIN)ruff format .

@@ -272,8 +272,6 @@ def main(cfg: StudyConfig) -> None:
         study(cfg)
     except (ValueError, OSError, ImportError) as error:
         sys.exit(f"Error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("Interrupted: the same command continues.")
 
 
 if __name__ == "__main__":

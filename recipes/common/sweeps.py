@@ -1,8 +1,8 @@
-"""How the runs of a sweep (``-m``) are started: ``hydra/launcher=cores``, beside ``slurm`` in ``conf/hydra/launcher``.
+"""How the runs of a sweep (``-m``) are started: ``hydra/launcher=cores``, or one of ``conf/hydra/launcher``.
 
-``cores`` runs them side by side on this machine, as many as there are cores, where the extra ``sweeps`` is installed,
-and one after the other where it isn't, so that a recipe can name it as its default. It is no YAML file because it
-depends on what is installed. Each run is one thread; recipes see to that themselves.
+``cores`` is ``ray``, which runs them side by side on this machine or on a cluster, where the extra ``sweeps`` is
+installed, and one after the other where it isn't, so that a recipe can name it as its default. It is no YAML file
+because it depends on what is installed. Each run is one thread; recipes see to that themselves.
 
 A run that fails does not stop the others: it returns its error, and :class:`SweepSummary`, named under
 ``hydra.callbacks``, lists the errors when all have ended.
@@ -10,12 +10,12 @@ A run that fails does not stop the others: it returns its error, and :class:`Swe
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import shutil
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +31,16 @@ from recipes.common.help import help_text
 __all__ = ["SweepSummary", "cores", "fail", "in_sweep", "start"]
 
 
-def _installed(plugin: str) -> bool:
-    try:
-        return importlib.util.find_spec(f"hydra_plugins.{plugin}") is not None
-    except ModuleNotFoundError:  # no plug-in at all
-        return False
-
-
 def cores(installed: bool) -> dict[str, Any]:
-    """The launcher ``cores``: a process per core, or Hydra's own launcher without the plug-in."""
-    return {"defaults": ["joblib"], "n_jobs": -1} if installed else {"defaults": ["basic"]}
+    """The launcher ``cores``: a process per core, or Hydra's own launcher without Ray."""
+    return {"defaults": ["ray" if installed else "basic"]}
 
 
-ConfigStore.instance().store(group="hydra/launcher", name="cores", node=cores(_installed("hydra_joblib_launcher")))
+ConfigStore.instance().store(group="hydra/launcher", name="cores", node=cores(find_spec("ray") is not None))
 
 
 def start(main: Callable[[], Any], name: str) -> None:
-    """Run the command of the recipe ``conf/<name>.yaml``, or say its help.
+    """Run the command of the recipe ``conf/<name>.yaml``, or say its help. Ctrl-C ends it with a line.
 
     ``key=~/x`` is in one's home directory, which the shell and Hydra leave to others.
     """
@@ -56,7 +49,11 @@ def start(main: Callable[[], Any], name: str) -> None:
         return
     home = re.compile(r"(?<==)~(?=/|$)")
     sys.argv[1:] = [home.sub(str(Path.home()), word) for word in sys.argv[1:]]
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        print("Interrupted: the same command continues.", file=sys.stderr, flush=True)
+        sys.exit(130)
 
 
 def in_sweep() -> bool:

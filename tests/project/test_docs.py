@@ -46,7 +46,7 @@ def run(command: str, folder: Path) -> int | str | None:
     words = command.split()
     assert words[:2] == ["python", "-m"], f"{command}: no command that a test knows to run"
     assert words[2] in SHORT, f"{command}: no recipe that a test knows to make short"
-    more = ["hydra.launcher.n_jobs=1"] if "-m" in words[3:] else []
+    more = ["hydra/launcher=basic"] if "-m" in words[3:] else []
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does

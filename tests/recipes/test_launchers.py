@@ -1,10 +1,8 @@
-"""Sweeps: runs side by side on the cores of a machine, and on a cluster."""
+"""Sweeps: one run after the other, and on a cluster of Slurm."""
 
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,71 +10,25 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.utils import instantiate
+from sweep_cases import sweep
 
 import recipes.gridworld.config  # noqa: F401 (stores the schema)
 from recipes.common.sweeps import cores
 
-pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
 submitit = pytest.importorskip("submitit")
 
 ROOT = Path(__file__).parents[2]
 
-# A recipe that does nothing, below the configuration of those that do: its launchers are theirs.
-RECIPE = """
-import os
-import hydra
-from hydra.core.config_store import ConfigStore
-import recipes.common.sweeps
 
-ConfigStore.instance().store(
-    name="nothing",
-    node={
-        "defaults": ["_self_", {"override hydra/launcher": "cores"}],
-        "seed": 0,
-        "broken": -1,
-        "out": "out",
-        "hydra": {"run": {"dir": "."}, "sweep": {"dir": "sweep", "subdir": "."}, "output_subdir": None},
-    },
-)
-
-@hydra.main(version_base="1.3", config_path="{conf}", config_name="nothing")
-def main(cfg):
-    if cfg.seed == cfg.broken:
-        raise ValueError(f"seed {cfg.seed} is broken")
-    with open(f"{cfg.out}/{cfg.seed}", "w") as file:
-        file.write(f"{os.getpid()} {os.environ.get('OMP_NUM_THREADS')}")
-
-if __name__ == "__main__":
-    main()
-"""
-
-
-def sweep(folder: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, list[str]]]:
-    (folder / "nothing.py").write_text(RECIPE.replace("{conf}", str(ROOT / "conf")))
-    (folder / "out").mkdir()
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "nothing.py", "-m", *arguments]
-    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    return result, {file.name: file.read_text().split() for file in sorted((folder / "out").iterdir())}
-
-
-def test_a_sweep_runs_on_processes_of_its_own_with_one_thread_each(tmp_path: Path) -> None:
-    result, done = sweep(tmp_path, "seed=range(3)", "hydra.launcher.n_jobs=2")
-    assert result.returncode == 0, result.stderr
-    assert list(done) == ["0", "1", "2"]
-    cores_each = max(1, len(os.sched_getaffinity(0)) // 2)
-    assert {int(threads) for _, threads in done.values()} <= set(range(1, cores_each + 1))
-
-
-@pytest.mark.parametrize("launcher", ["cores", "basic", "submitit_local"])
+@pytest.mark.parametrize("launcher", ["basic", "submitit_local"])
 def test_a_broken_run_does_not_stop_the_others(tmp_path: Path, launcher: str) -> None:
-    result, done = sweep(tmp_path, "seed=range(3)", "broken=0", f"hydra/launcher={launcher}")
+    result, done = sweep(tmp_path, "seed=range(3)", "raises=0", f"hydra/launcher={launcher}")
     assert list(done) == ["1", "2"]
     assert result.returncode != 0
     assert "seed 0 is broken" in result.stderr
 
 
-def test_cores_falls_back_to_one_run_after_the_other_without_the_plugin(tmp_path: Path) -> None:
+def test_cores_falls_back_to_one_run_after_the_other_without_ray(tmp_path: Path) -> None:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         Plugins.instance()
         ConfigStore.instance().store(group="hydra/launcher", name="alone", node=cores(installed=False))

@@ -1,0 +1,70 @@
+"""A sweep whose runs do nothing, and files of runs to compare."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+
+ROOT = Path(__file__).parents[2]
+
+# A recipe that does nothing, below the configuration of those that do: its launchers are theirs.
+RECIPE = """
+import os
+import signal
+import hydra
+from hydra.core.config_store import ConfigStore
+import recipes.common.sweeps
+
+ConfigStore.instance().store(
+    name="nothing",
+    node={
+        "defaults": ["_self_", {"override hydra/launcher": "cores"}],
+        "seed": 0,
+        "raises": -1,
+        "fails": -1,
+        "dies": -1,
+        "out": "out",
+        "hydra": {
+            "run": {"dir": "."},
+            "sweep": {"dir": "sweep", "subdir": "."},
+            "output_subdir": None,
+            "callbacks": {"summary": {"_target_": "recipes.common.sweeps.SweepSummary"}},
+        },
+    },
+)
+
+@hydra.main(version_base="1.3", config_path="{conf}", config_name="nothing")
+def main(cfg):
+    if cfg.seed == cfg.raises:
+        raise ValueError(f"seed {cfg.seed} is broken")
+    if cfg.seed == cfg.fails:
+        return "Error: it failed"
+    if cfg.seed == cfg.dies:
+        os.kill(os.getpid(), signal.SIGKILL)
+    with open(f"{cfg.out}/{cfg.seed}", "w") as file:
+        file.write(f"{os.getpid()} {os.environ.get('OMP_NUM_THREADS')}")
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def sweep(folder: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, list[str]]]:
+    """Sweep in a folder; what was said, and the process and the threads of each run that came to its end."""
+    (folder / "nothing.py").write_text(RECIPE.replace("{conf}", str(ROOT / "conf")))
+    (folder / "out").mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "nothing.py", "-m", *arguments]
+    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return result, {file.name: file.read_text().split() for file in sorted((folder / "out").iterdir())}
+
+
+def results(run: Path) -> dict[str, bytes]:
+    """What must be the same however a run came to its end: all of its tables but for the speed, and the policy."""
+    kept = {name: (run / name).read_bytes() for name in ("eval.csv", "policy.safetensors")}
+    metrics = pd.read_csv(run / "metrics.csv", dtype=str).drop(columns="fps")
+    return kept | {"metrics.csv": metrics.to_csv().encode()}
