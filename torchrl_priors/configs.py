@@ -70,9 +70,12 @@ def _maker(cls: Callable[..., Any]) -> Callable[..., Any]:
 
 
 # What configs name as their targets.
-make_action_prior, make_artifact_prior = _maker(ActionPrior), _maker(load_prior)
-make_boltzmann_prior, make_uniform_prior = _maker(BoltzmannPrior), _maker(UniformPrior)
-make_prior_weight, make_prior_log_prob = _maker(PriorWeight), _maker(PriorLogProb)
+make_action_prior = _maker(ActionPrior)
+make_artifact_prior = _maker(load_prior)
+make_boltzmann_prior = _maker(BoltzmannPrior)
+make_uniform_prior = _maker(UniformPrior)
+make_prior_weight = _maker(PriorWeight)
+make_prior_log_prob = _maker(PriorLogProb)
 make_prior_shaping = _maker(PriorShaping)
 
 

@@ -271,8 +271,9 @@ class VectorCollector(CollectorInterface):
     def state_dict(self) -> dict[str, Any]:
         """All that the next rollout depends on but the policy, as tensors, numbers and strings in nested dicts.
 
-        Take it between rollouts. A collector that loads it, in this process or another, continues bit by bit, given the
-        same policy, machine and versions.
+        Take it between rollouts; :func:`torch.save` (with ``weights_only``) and ``torchrl.checkpoint`` write it. A
+        collector that loads it, in this process or another, continues bit by bit, given the same policy, machine and
+        versions.
 
         Raises:
             TypeError: the state of an environment cannot be saved, see :func:`env_state_dict`.
