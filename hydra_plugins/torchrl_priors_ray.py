@@ -18,8 +18,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
-#: No reports to Ray's makers, every line of every run, and the devices that the user chose; a user may say otherwise.
-_SETTINGS = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_DEDUP_LOGS": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+#: No reports to Ray's makers, and the devices that the user chose; a user may say otherwise.
+_SETTINGS = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 #: Bytes for the results of runs, which are a line each: near the least that Ray takes.
 _STORE = 80 * 2**20
 

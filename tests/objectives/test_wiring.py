@@ -80,7 +80,16 @@ def test_what_belongs_together_is_silent(method: str) -> None:
 
 @pytest.mark.parametrize(
     ("method", "other"),
-    [("e2r", "er"), ("er", "e2r"), ("e2r", "ae2r"), ("ae2r", "aer"), ("aer", "ae2r"), ("kickstart", "e2r")],
+    [
+        ("e2r", "er"),
+        ("er", "e2r"),
+        ("e2r", "ae2r"),
+        ("ae2r", "aer"),
+        ("aer", "ae2r"),
+        ("ae2r", "e2r"),
+        ("aer", "er"),
+        ("kickstart", "e2r"),
+    ],
 )
 def test_a_bonus_of_another_method_is_warned_of_once(method: str, other: str) -> None:
     loss = make_loss(method)

@@ -12,7 +12,7 @@ from torch import nn
 from torch.distributions import Categorical
 from torchrl.modules import GRUModule, LSTMModule, ProbabilisticActor
 
-from torchrl_priors import ActionPrior, AE2RLoss, ModulePrior, PriorLogProb
+from torchrl_priors import ActionPrior, AE2RLoss, BoltzmannPrior, ModulePrior, PriorLogProb
 from torchrl_priors.priors.memory import without_memory
 
 
@@ -33,6 +33,29 @@ class Overwrites(Replaces):
         new = self.cell(observation, self.hidden.expand(observation.shape[0], 2))
         self.hidden[:] = new.mean(0, keepdim=True)
         return new
+
+
+class Assigns(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.cell = nn.GRUCell(3, 2)
+        self.hidden = torch.zeros(1, 2)  # no buffer
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        new = self.cell(observation, self.hidden.expand(observation.shape[0], 2))
+        self.hidden = new.mean(0, keepdim=True)
+        return new
+
+
+class Counts(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = nn.Linear(3, 2)
+        self.steps = 1000
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        self.steps += 1
+        return self.net(observation) * self.steps
 
 
 def recurrent(kind: Any) -> ProbabilisticActor:
@@ -66,6 +89,16 @@ def test_so_is_one_in_torchscript(kind: Any) -> None:
     plain = torch.jit.script(nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))).eval()
     with without_memory(plain), torch.no_grad():
         plain(torch.randn(5, 3))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+@pytest.mark.parametrize("freeze", [False, True])
+@pytest.mark.parametrize(("kind", "name"), [(Assigns, "hidden"), (Counts, "steps")])
+def test_what_torchscript_assigns_to_itself_is_a_memory(kind: Any, name: str, freeze: bool) -> None:
+    script = torch.jit.script(nn.Sequential(kind()).eval())
+    prior = BoltzmannPrior(torch.jit.freeze(script) if freeze else script)
+    with pytest.raises(NotImplementedError, match=rf"a memory: it changed .*\b{name} when"):
+        prior.get_dist(TensorDict(observation=torch.randn(5, 3), batch_size=[5]))
 
 
 def test_a_recurrence_within_one_observation_is_none() -> None:

@@ -13,9 +13,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import distributions as d
 from torch import nn
-from torchrl.modules import IndependentNormal
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from torchrl_priors import ModulePrior
+from torchrl_priors import ActionPrior, AffordancePrior, BoltzmannPrior, ModulePrior
 
 
 class TestModulePrior:
@@ -122,3 +122,25 @@ class TestModulePrior:
             )
         with pytest.raises(ValueError, match="action space of the prior differs"):
             ModulePrior(net, "logits").log_prob(observations(2).set("action", torch.zeros(2, 4)))
+
+
+def actor_of(network: nn.Module) -> ActionPrior:
+    module = TensorDictModule(network, in_keys=["observation"], out_keys=["logits"])
+    return ActionPrior(ProbabilisticActor(module, in_keys=["logits"], distribution_class=d.Categorical))
+
+
+@pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
+@pytest.mark.parametrize("make", [ActionPrior, BoltzmannPrior, AffordancePrior])
+@pytest.mark.parametrize("kind", ["script", "trace"])
+def test_networks_of_torchscript_advise_and_are_copied(make: Any, kind: str) -> None:
+    make = actor_of if make is ActionPrior else make
+    net = nn.Sequential(nn.Linear(OBS, ACTIONS), nn.Dropout(), nn.Softplus()).eval()
+    script = torch.jit.script(net) if kind == "script" else torch.jit.trace(net, torch.zeros(1, OBS))
+    batch, expected = observations(2, 3), make(net)
+    prior = make(script)
+    with torch.no_grad():
+        next(script.parameters()).add_(1)
+    for twin in (prior, deepcopy(prior)):
+        torch.testing.assert_close(twin.get_dist(batch).logits, expected.get_dist(batch).logits)
+        assert not any(parameter.requires_grad for parameter in twin.parameters())
+    assert all(parameter.requires_grad for parameter in script.parameters())

@@ -46,7 +46,7 @@ class ActionPrior(Prior):
             :class:`BoltzmannPrior`).
         ValueError: the distribution is a point mass, which has no log-probability to advise with.
         NotImplementedError: the distribution is a composite of several actions, or the policy has a memory: it reads a
-            hidden state, or, at the first call, it changed a buffer.
+            hidden state, or, at the first call, it changed a buffer or what TorchScript assigns to itself.
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
@@ -70,7 +70,9 @@ class ActionPrior(Prior):
         refuse_hidden_states(module)
         names = [key[-1] if isinstance(key, tuple) else key for key in last.dist_keys]
         super().__init__(module.in_keys, names, last.distribution_class, namespace=namespace)
-        self.module = deepcopy(module).requires_grad_(False).eval()
+        with torch.no_grad():  # TorchScript copies parameters by an operation that has a gradient
+            self.module = deepcopy(module)
+        self.module.requires_grad_(False).eval()
         self._has_run = False
 
     @torch.no_grad()

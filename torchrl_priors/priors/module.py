@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
 from typing import Any, Literal, get_args
 
 import torch
@@ -82,11 +81,6 @@ class ModulePrior(ActionPrior):
             )
         if output not in get_args(_Output):
             raise ValueError(f"Unknown output {output!r}: expected one of {', '.join(get_args(_Output))}.")
-        if isinstance(module, torch.jit.ScriptModule):
-            with torch.no_grad():  # TorchScript copies parameters by an operation that has a gradient
-                module = deepcopy(module)
-            for parameter in module.parameters():
-                parameter.requires_grad_(False)
         discrete = output in ("logits", "probs")
         if output == "distribution":
             if distribution_class is None:

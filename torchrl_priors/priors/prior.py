@@ -147,6 +147,8 @@ class Prior(TensorDictModuleBase, ABC):
             )
         if not is_compiling():
             self._check_values(action, dist, differs)
+        if not action.numel() and action.is_floating_point():  # torch can't sum over the dimensions of no action
+            return action.new_empty(tensordict.batch_size)
         log_prob = dist.log_prob(action)
         return log_prob.flatten(tensordict.ndim).sum(-1) if log_prob.ndim > tensordict.ndim else log_prob
 
