@@ -45,6 +45,14 @@ class TestMakeActor:
         assert batch["action"].shape == batch["loc"].shape == batch["scale"].shape == (2, 4, ACTIONS)
         assert batch["action_log_prob"].shape == (2, 4)
 
+    def test_a_discrete_one_starts_near_the_uniform_policy_over_indices(self) -> None:
+        actor = make_actor(OBS, ACTIONS, discrete=True)
+        batch = actor(observations(100))
+        assert set(batch.keys()) == {"observation_norm", "logits", "action", "action_log_prob"}
+        assert batch["action"].shape == (100,)
+        assert set(batch["action"].tolist()) == set(range(ACTIONS))
+        assert actor.get_dist(batch).probs.sub(1 / ACTIONS).abs().max() < 0.05
+
     def test_log_prob_is_that_of_the_unbounded_gaussian(self) -> None:
         with torch.no_grad():
             batch = make_actor(OBS, ACTIONS)(observations(4))

@@ -9,6 +9,7 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import Tensor, nn
+from torch.distributions import Categorical
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 from torchrl_priors.prior_weight import PriorWeight
@@ -80,28 +81,31 @@ def make_actor(
     activation: str = "tanh",
     in_key: NestedKey = "observation_norm",
     *,
+    discrete: bool = False,
     generator: torch.Generator | None = None,
     device: torch.device | str | None = None,
 ) -> ProbabilisticActor:
-    """A Gaussian policy that reads normalised observations: its actions are not squashed, and not bounded.
+    """A policy that reads normalised observations: Gaussian, its actions neither squashed nor bounded; or categorical.
 
     Orthogonal weights of gain √2, and 0.01 in the last layer (CleanRL's ``ppo_continuous_action``); biases and the
     logarithm of the standard deviation start at 0. ``reset_parameters_recursive`` would draw PyTorch's defaults.
 
     Args:
         obs_dim (int): features of an observation.
-        act_dim (int): dimensions of an action.
+        act_dim (int): dimensions of an action, or how many actions there are.
         hidden (sequence of int): cells of each hidden layer. Defaults to ``(64, 64)``.
         activation (str): one of :data:`ACTIVATIONS`. Defaults to ``"tanh"``.
         in_key (NestedKey): observations ``[*B, obs_dim]``. Defaults to ``"observation_norm"``.
 
     Keyword Args:
+        discrete (bool): whether actions are indices. Defaults to ``False``.
         generator (torch.Generator, optional): draws the weights. Defaults to torch's global generator.
         device (torch.device, optional): defaults to torch's.
 
     Returns:
         ProbabilisticActor: writes ``loc`` and ``scale`` ``[*B, act_dim]``, ``action`` ``[*B, act_dim]`` and
-        ``action_log_prob`` ``[*B]``, of an :class:`~torchrl.modules.IndependentNormal`.
+        ``action_log_prob`` ``[*B]``, of an :class:`~torchrl.modules.IndependentNormal`. With ``discrete`` it writes
+        ``logits`` ``[*B, act_dim]`` and ``action`` ``[*B]``, of a :class:`~torch.distributions.Categorical`.
 
     Raises:
         ValueError: as :class:`GaussianMLP`.
@@ -113,6 +117,15 @@ def make_actor(
         >>> batch["action"].shape, batch["action_log_prob"].shape
         (torch.Size([8, 6]), torch.Size([8]))
     """
+    if discrete:
+        logits = _mlp(obs_dim, act_dim, tuple(hidden), activation, device)
+        _orthogonal(logits, last_gain=0.01, generator=generator)
+        return ProbabilisticActor(
+            TensorDictModule(logits, in_keys=[in_key], out_keys=["logits"]),
+            in_keys=["logits"],
+            distribution_class=Categorical,
+            return_log_prob=True,
+        )
     net = GaussianMLP(obs_dim, act_dim, hidden, activation, device=device)
     _orthogonal(net.mean, last_gain=0.01, generator=generator)
     return gaussian_actor(net, in_key)

@@ -1,1 +1,1 @@
-"""PPO on MuJoCo with a teacher: ``python -m recipes.mujoco``."""
+"""PPO with a teacher, on MuJoCo or any environment of Gymnasium: ``python -m recipes.mujoco``."""

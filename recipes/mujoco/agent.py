@@ -14,8 +14,9 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from recipes.common.schedules import applies, make_schedule
-from recipes.mujoco.config import MujocoConfig, method_of, teachers
+from recipes.mujoco.config import MujocoConfig, method_of, sources
 from recipes.mujoco.task import Task
+from recipes.mujoco.teachers import ReversedPrior
 from torchrl_priors import (
     AE2RLoss,
     AVECMixin,
@@ -44,13 +45,13 @@ class AVECClipPPOPriorLoss(AVECMixin, ClipPPOPriorLoss):
 
 def make_prior(cfg: MujocoConfig, task: Task) -> Prior:
     """The teacher, degraded as the configuration says."""
-    (prior,) = (task.teachers[str(file)] for file in teachers(cfg))
+    (prior,) = (task.teachers[source.text] for source in sources(cfg))
     if cfg.prior.degrade == "structural":
         feature, threshold = cfg.prior.feature, cfg.prior.threshold
         return StructuralDegradation(prior, lambda td: td["observation"][..., feature] > threshold)
     if cfg.prior.degrade == "random":
         return RandomDegradation(prior, cfg.prior.prob, seed=cfg.seed)
-    return prior
+    return ReversedPrior(prior, task.actions) if cfg.prior.degrade == "reversed" else prior
 
 
 class OracleWeight(nn.Module):
@@ -83,11 +84,11 @@ class Agent(nn.Module):
 
     def __init__(self, cfg: MujocoConfig, task: Task) -> None:
         super().__init__()
-        spec, obs_dim, act_dim = method_of(cfg), task.obs_dim, task.act_dim
+        spec, obs_dim = method_of(cfg), task.obs_dim
         hidden = list(cfg.ppo.hidden)
         self.spec, self.cfg = spec, cfg
         self.normalizer = RunningNorm(obs_dim)
-        self.actor = make_actor(obs_dim, act_dim, hidden)
+        self.actor = make_actor(obs_dim, task.act_dim, hidden, discrete=task.discrete)
         self.critic = make_critic(obs_dim, hidden)
         self.critic.module = nn.Sequential(self.critic.module, ValueOffset())
         options: dict[str, Any] = {"bonus_coeff": cfg.bonus_coeff, "td_error": cfg.td_error, "functional": False}

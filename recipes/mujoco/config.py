@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING
+from omegaconf import MISSING, OmegaConf
 
 import recipes.common.sweeps  # noqa: F401  registers the launcher that conf/mujoco.yaml names
 from recipes.common.checks import (
@@ -27,7 +28,7 @@ from recipes.common.loggers import LOGGERS, require_logger
 from recipes.common.schedules import ScheduleConfig, check_schedule
 from torchrl_priors.methods import MethodSpec, get_method
 
-__all__ = ["ALONE", "MujocoConfig", "check", "method_of", "teachers"]
+__all__ = ["ALONE", "MujocoConfig", "Source", "check", "env_id", "method_of", "sources"]
 
 ALONE = "alone"
 """The student of a trial that has no teacher."""
@@ -38,7 +39,7 @@ class Env:
     """The task, and what is tuned to it."""
 
     id: str = MISSING
-    version: str = MISSING
+    version: str | None = MISSING
     num_envs: int = positive()
     frames_per_batch: int = positive()
     minibatch_size: int = positive()
@@ -53,7 +54,13 @@ class Prior:
     """The teacher."""
 
     path: Any = MISSING
-    degrade: str = one_of("none", "structural", "random")
+    vecnormalize: str | None = MISSING
+    outputs: list[str] | None = MISSING
+    std: float | None = positive()
+    temperature: float | None = positive()
+    epsilon: float = share()
+    trust_code: bool = MISSING
+    degrade: str = one_of("none", "structural", "random", "reversed")
     feature: int = MISSING
     threshold: float = finite()
     prob: float = share()
@@ -147,13 +154,53 @@ class MujocoConfig:
 
 
 ConfigStore.instance().store(group="schema", name="mujoco", node=MujocoConfig, package="_global_")
+# the method where none is given
+OmegaConf.register_new_resolver("method_for", lambda path: "none" if path is None else "trial", replace=True)
 
 
-def teachers(cfg: MujocoConfig) -> list[Path]:
-    """The teachers' files."""
+def env_id(cfg: MujocoConfig) -> str:
+    """The environment, as Gymnasium knows it."""
+    return cfg.env.id if cfg.env.version is None else f"{cfg.env.id}-{cfg.env.version}"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a teacher comes from: a file, or code of the user's, ``module:function``."""
+
+    text: str
+
+    def __str__(self) -> str:
+        """As it was given."""
+        return self.text
+
+    @property
+    def path(self) -> Path:
+        """Of its file."""
+        return at_home("prior.path", self.text)
+
+    @property
+    def kind(self) -> str:
+        """``file`` (of this library), ``sb3``, ``torchscript`` or ``code``."""
+        if re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*", self.text):
+            return "code"
+        return {".zip": "sb3", ".pt": "torchscript"}.get(self.path.suffix, "file")
+
+    @property
+    def name(self) -> str:
+        """What its student is called."""
+        return self.text if self.kind == "code" else self.path.stem
+
+    @property
+    def file_name(self) -> str:
+        """The same with the file's ending."""
+        return self.text if self.kind == "code" else self.path.name
+
+
+def sources(cfg: MujocoConfig) -> list[Source]:
+    """The teachers, by where they come from."""
     path = cfg.prior.path
     several = path if isinstance(path, Sequence) and not isinstance(path, str) else [path]
-    return [] if path is None else [at_home("prior.path", str(one)) for one in several]
+    return [] if path is None else [Source(str(one)) for one in several]
 
 
 def method_of(cfg: MujocoConfig) -> MethodSpec:
@@ -175,12 +222,13 @@ def check(cfg: MujocoConfig) -> None:
     """
     check_keys(cfg)
     method_of(cfg)  # that there is such a method
-    files = teachers(cfg)
+    files = sources(cfg)
     if cfg.method == "trial":
         _check_arms(cfg, files)
     elif cfg.method != "none":
         expected = "the file of a teacher" if not files else "one teacher; method=trial takes several"
         require(len(files) == 1, "prior.path", cfg.prior.path, f"{expected}, as method={cfg.method} has one")
+    _check_reading(cfg, [file.kind for file in files])
     if cfg.method == "trial" or cfg.let_go.methods == "all":
         _check_trial(cfg)
     check_schedule(cfg.schedule)
@@ -205,10 +253,23 @@ def check(cfg: MujocoConfig) -> None:
     require_compiler(cfg.compile)
 
 
-def _check_arms(cfg: MujocoConfig, files: Sequence[Path]) -> None:
+def _check_reading(cfg: MujocoConfig, kinds: Sequence[str]) -> None:
+    prior, outputs = cfg.prior, list(cfg.prior.outputs or [])
+    expected = "null, or the file of VecNormalize.save beside prior.path=<one .zip of Stable-Baselines3>"
+    require(prior.vecnormalize is None or kinds.count("sb3") == 1, "prior.vecnormalize", prior.vecnormalize, expected)
+    if "torchscript" in kinds:
+        known = [["loc", "scale"], ["logits"], ["action"]]
+        expected = "[loc,scale], [logits] or [action], what the teacher of prior.path=<a .pt of TorchScript> gives"
+        require(outputs in known, "prior.outputs", prior.outputs, expected)
+    else:
+        require(not outputs, "prior.outputs", prior.outputs, "null, but for prior.path=<a .pt of TorchScript>")
+    require(prior.epsilon > 0, "prior.epsilon", prior.epsilon, "a probability above 0")
+
+
+def _check_arms(cfg: MujocoConfig, files: Sequence[Source]) -> None:
     arms, method = len(files) + 1, cfg.trial.method
     require(bool(files), "prior.path", cfg.prior.path, "the files of one or more teachers, as method=trial tries them")
-    names = [file.stem for file in files]
+    names = [file.name for file in files]
     require(len({*names, ALONE}) == arms, "prior.path", cfg.prior.path, f"files of different names, none {ALONE!r}")
     require(method != "none", "trial.method", method, "a method with a teacher")
     batch = cfg.env.frames_per_batch

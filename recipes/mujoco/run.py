@@ -20,10 +20,11 @@ from tqdm import tqdm
 from recipes.common.checkpoints import Checkpoints
 from recipes.common.loggers import RunLogger
 from recipes.common.progress import progress_bar
-from recipes.common.run_folder import RunFolder, digest, read_json, sha256
+from recipes.common.run_folder import RunFolder, digest, read_json
 from recipes.common.schedules import without_idle
 from recipes.common.sweeps import fail, in_sweep
-from recipes.mujoco.config import MujocoConfig, teachers
+from recipes.mujoco.config import MujocoConfig, env_id
+from recipes.mujoco.teachers import identify
 from torchrl_priors import policy_prior, save_prior
 from torchrl_priors.collectors.evaluation import Evaluation
 from torchrl_priors.teacher_trial import TrialResult
@@ -59,12 +60,8 @@ class Run:
         idle = [] if cfg.method == "trial" or cfg.let_go.methods == "all" else ["trial", "let_go"]
         matters = {key: value for key, value in matters.items() if key not in idle}
         matters = without_idle(matters, cfg.schedule, [cfg.trial.method if cfg.method == "trial" else cfg.method])
-        if files := teachers(cfg):
-            names, digests = [file.name for file in files], [sha256(file) for file in files]
-            one = isinstance(cfg.prior.path, str)
-            matters["prior"] |= {"path": names[0] if one else names, "sha256": digests[0] if one else digests}
-        env = f"{cfg.env.id}-{cfg.env.version}"
-        path = Path(cfg.out or f"outputs/mujoco/{env}/{cfg.method}-{digest(matters)}")
+        matters["prior"] = identify(cfg, matters["prior"])
+        path = Path(cfg.out or f"outputs/mujoco/{env_id(cfg)}/{cfg.method}-{digest(matters)}")
         self.cfg = cfg
         self.frames = 0
         self.is_to_stop = False

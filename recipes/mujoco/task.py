@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from gymnasium.vector import VectorEnv
 from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, TensorSpec
 
 from recipes.common.checks import require
-from recipes.mujoco.config import MujocoConfig, check, teachers
+from recipes.mujoco.config import MujocoConfig, Source, check, env_id, sources
+from recipes.mujoco.teachers import read_teacher
 from torchrl_priors import Prior
-from torchrl_priors.artifacts import ArtifactError, load_prior
-from torchrl_priors.collectors import make_vector_env
+from torchrl_priors.collectors import env_state_dict, make_vector_env
 from torchrl_priors.collectors.vector_env import check_vector_env
 from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.networks import make_actor
@@ -28,15 +28,25 @@ class Task:
     Attributes:
         env_id: with its version, as Gymnasium knows it.
         obs_dim: features of an observation.
-        act_dim: dimensions of an action.
-        teachers: by their files, as they are in them.
+        actions: how many discrete ones there are, or their dimensions and bounds.
+        teachers: by ``prior.path``, as they are there.
     """
 
     env_id: str
     kwargs: dict[str, object]
     obs_dim: int
-    act_dim: int
+    actions: TensorSpec
     teachers: dict[str, Prior]
+
+    @property
+    def discrete(self) -> bool:
+        """Whether an action is one of some."""
+        return isinstance(self.actions, Categorical)
+
+    @property
+    def act_dim(self) -> int:
+        """Dimensions of an action, or how many discrete ones there are."""
+        return self.actions.n if self.discrete else self.actions.shape[0]
 
     def make_env(self, number: int) -> VectorEnv:
         """So many environments."""
@@ -51,21 +61,30 @@ def open_task(cfg: MujocoConfig) -> Task:
         ImportError: names the extra that is needed.
     """
     check(cfg)
-    env_id, kwargs = f"{cfg.env.id}-{cfg.env.version}", dict(cfg.env.kwargs)
-    obs_dim, act_dim = _sizes(env_id, kwargs)
-    files = teachers(cfg) if cfg.method != "none" else []
-    return Task(
-        env_id, kwargs, obs_dim, act_dim, {str(file): _read(cfg, file, env_id, obs_dim, act_dim) for file in files}
-    )
+    name, kwargs = env_id(cfg), dict(cfg.env.kwargs)
+    obs_dim, actions = _spaces(name, kwargs)
+    task = Task(name, kwargs, obs_dim, actions, {})
+    for source in sources(cfg) if cfg.method != "none" else []:
+        task.teachers[source.text] = _read(cfg, source, task)
+    return task
 
 
-def _sizes(env_id: str, kwargs: dict[str, object]) -> tuple[int, int]:
-    """Features of an observation and dimensions of an action, of an environment that is built to see them."""
+def _spaces(env_id: str, kwargs: dict[str, object]) -> tuple[int, TensorSpec]:
+    """Features of an observation, and the actions, of an environment that is built to see them."""
     try:
         env = make_vector_env(env_id, 1, **kwargs)
         check_vector_env(env)
+        observations, actions = env.single_observation_space, env.single_action_space
+        for space in (observations, actions):
+            if type(space).__name__ == "Box" and (len(space.shape) != 1 or not space.shape[0]):
+                raise TypeError(f"Observations and actions must have one dimension, such as (8,), got {space.shape}")
+        env.reset(seed=0)
+        env_state_dict(env)  # what can't be saved is found out now
         env.close()
-        return env.single_observation_space.shape[0], env.single_action_space.shape[0]
+        if type(actions).__name__ == "Discrete":
+            return observations.shape[0], Categorical(int(actions.n))
+        low, high = (torch.as_tensor(bound, dtype=torch.float32) for bound in (actions.low, actions.high))
+        return observations.shape[0], Bounded(low, high, dtype=torch.float32)
     except Exception as error:  # Gymnasium's own, or whatever its environments raise
         if isinstance(error, ImportError) and ":" not in env_id:  # MuJoCo is missing; a:b is environment b of module a
             raise
@@ -73,23 +92,17 @@ def _sizes(env_id: str, kwargs: dict[str, object]) -> tuple[int, int]:
         raise ValueError(f"env={env_id}{given}: cannot be used ({type(error).__name__}: {error}).") from None
 
 
-def _read(cfg: MujocoConfig, path: Path, env_id: str, obs_dim: int, act_dim: int) -> Prior:
-    """A teacher from its file."""
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"prior.path={path}: {'a folder, expected a file' if path.is_dir() else 'no such file'}."
-        )
-    try:
-        prior: Prior = load_prior(path, env_id=env_id, observation_spec=obs_dim, action_spec=act_dim)
-    except ArtifactError as error:
-        raise ValueError(f"prior.path: {error}") from None
-    nothing = torch.zeros(1, obs_dim)
+def _read(cfg: MujocoConfig, source: Source, task: Task) -> Prior:
+    """A teacher that the student can learn from."""
+    prior = read_teacher(cfg, source, task.env_id, task.obs_dim, task.actions)
+    nothing = torch.zeros(1, task.obs_dim)
     states = TensorDict(observation=nothing, observation_norm=nothing, batch_size=[1])
+    student = make_actor(task.obs_dim, task.act_dim, discrete=task.discrete)
     try:
-        cross_entropy(make_actor(obs_dim, act_dim).get_dist(states.copy()), prior.get_dist(states))
+        cross_entropy(student.get_dist(states.copy()), prior.get_dist(states))
     except (ValueError, NotImplementedError) as error:  # a teacher of bounded actions, say
-        raise ValueError(f"prior.path={path}: no student of this recipe can learn from it: {error}") from None
+        raise ValueError(f"prior.path={source}: no student of this recipe can learn from it: {error}") from None
     if cfg.prior.degrade == "structural":
-        feature = cfg.prior.feature
-        require(0 <= feature < obs_dim, "prior.feature", feature, f"a number from 0 to {obs_dim - 1}")
+        feature, last = cfg.prior.feature, task.obs_dim - 1
+        require(0 <= feature <= last, "prior.feature", feature, f"a number from 0 to {last}")
     return prior

@@ -10,6 +10,7 @@ from recipes.mujoco.config import MujocoConfig
 from recipes.mujoco.run import Run, Supervisor
 from recipes.mujoco.task import Task, open_task
 from recipes.mujoco.trial import Students
+from recipes.mujoco.worth import keep_worth, play_teachers, worth_of
 from torchrl_priors.collectors import evaluate
 
 __all__ = ["run", "train"]
@@ -26,6 +27,7 @@ def run(cfg: MujocoConfig) -> str | None:
         else:
             supervisor.run = run
             train(cfg, task, run)
+        print(worth_of(run.folder), end="\n" if cfg.method != "none" else "", flush=True)
     return supervisor.error
 
 
@@ -34,6 +36,7 @@ def train(cfg: MujocoConfig, task: Task, run: Run) -> None:
     test_env = task.make_env(cfg.evaluation.episodes)
     students = Students(cfg, task)
     run.begin(students)
+    play_teachers(cfg, task, test_env, run.folder)
 
     def evaluate_policy() -> None:
         agent = students.by_arm[students.chosen].agent
@@ -62,4 +65,5 @@ def train(cfg: MujocoConfig, task: Task, run: Run) -> None:
             run.log_trials(students.results)
         run.checkpoint_if_due(students)
     agent = students.by_arm[students.chosen].agent
+    keep_worth(cfg, run.folder, run.evaluations[-1], students.results)
     run.finish(agent.actor, agent.normalizer, task.env_id, arm=students.chosen if students.several else None)

@@ -9,11 +9,11 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from recipes.mujoco.agent import Student
-from recipes.mujoco.config import ALONE, MujocoConfig, teachers
+from recipes.mujoco.config import ALONE, MujocoConfig, sources
 from recipes.mujoco.task import Task
 from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 
-__all__ = ["Students", "arms"]
+__all__ = ["LET_GO", "Students", "arms"]
 
 LET_GO = ", let go"
 
@@ -26,7 +26,7 @@ def arms(cfg: MujocoConfig) -> dict[str, MujocoConfig]:
     taught: Any = {"method": cfg.trial.method}
     if cfg.let_go.methods == "trial":
         taught["let_go"] = {"methods": "all"}
-    each = {file.stem: taught | {"prior": {"path": str(file)}} for file in teachers(cfg)}
+    each = {source.name: taught | {"prior": {"path": source.text}} for source in sources(cfg)}
     return {
         arm: cast("MujocoConfig", OmegaConf.merge(cast("DictConfig", cfg), changed))
         for arm, changed in (alone | each).items()

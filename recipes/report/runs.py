@@ -134,7 +134,19 @@ def _read_whole(folder: Path) -> FinishedRun:
         settings=flatten(config),
         evaluations=_table(folder / "eval.csv", ["frames", "mean_return"], optional=()),
         metrics=_table(folder / "metrics.csv", needed, optional=("episode*", "aux_coeff", "bonus_coeff"), arm=arm),
+        teacher_return=_teacher_return(folder / "teacher.json"),
     )
+
+
+def _teacher_return(file: Path) -> float | None:
+    """The own return of a run's teacher; None of a run without one or with several."""
+    if not file.exists():
+        return None
+    try:
+        (teacher, *others) = json.loads(file.read_text())["teachers"].values()
+        return None if others else float(teacher["mean_return"])
+    except (ValueError, TypeError, KeyError, AttributeError, OSError):
+        raise _UnusableError("teacher.json is damaged") from None
 
 
 def _check_finished(folder: Path) -> dict[str, Any]:

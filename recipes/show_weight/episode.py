@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -14,17 +15,21 @@ from recipes import plots
 from recipes.common.checkpoints import Checkpoints
 from recipes.common.run_folder import read_json, sha256
 from recipes.mujoco.agent import Agent
+from recipes.mujoco.config import Source, env_id
 from recipes.mujoco.run import identity
 from recipes.mujoco.task import Task, open_task
 from recipes.plots.video import write_weight_video
 from recipes.show_weight.source import read_config, reading
 from torchrl_priors import PriorLogProb, StructuralDegradation
 from torchrl_priors.collectors import VectorCollector
-from torchrl_priors.collectors.vector_env import spread_seed
+from torchrl_priors.collectors.vector_env import action_limits, spread_seed
 from torchrl_priors.functional import td_residual
 from torchrl_priors.methods import get_method
 
 __all__ = ["show_episode"]
+
+#: Keys that older runs lack.
+_LATER = {"vecnormalize": None, "outputs": None, "std": None, "temperature": None, "epsilon": 0.1, "trust_code": False}
 
 
 def load_agent(folder: Path, teacher: str | None) -> tuple[Agent, Task]:
@@ -46,6 +51,9 @@ def _load_agent(folder: Path, cfg: Any, teacher: str | None) -> tuple[Agent, Tas
         raise ValueError(f"{folder} is a run of method={cfg.method}, which has no learned weight.")
     if teacher is not None:
         cfg.prior.path = teacher
+    if Source(str(cfg.prior.path)).kind in ("code", "torchscript"):
+        raise ValueError(f"{folder}: its teacher {cfg.prior.path} is a program, and is not run for a figure.")
+    cfg = OmegaConf.merge({"prior": _LATER}, cfg)
     matters = read_json(folder / "config.json")
     expected = matters["prior"]["sha256"]
     path = Path(cfg.prior.path)
@@ -53,9 +61,9 @@ def _load_agent(folder: Path, cfg: Any, teacher: str | None) -> tuple[Agent, Tas
         raise ValueError(f"The run's teacher {path} is not there: say where it is by episode.teacher=<file>.")
     if sha256(path) != expected:
         raise ValueError(f"{path} is not the teacher of {folder}: its content is another one.")
-    env_id = f"{cfg.env.id}-{cfg.env.version}"
-    if ":" in env_id:  # Gymnasium would import what is before it
-        raise ValueError(f"{folder} is a run of {env_id!r}: an environment that names a module to import is not shown.")
+    name = env_id(cfg)
+    if ":" in name:  # Gymnasium would import what is before it
+        raise ValueError(f"{folder} is a run of {name!r}: an environment that names a module to import is not shown.")
     task = open_task(cfg)
     agent = Agent(cfg, task)
     checkpoints = Checkpoints(folder / "checkpoints", cfg.checkpoint.keep, identity(matters))
@@ -113,11 +121,11 @@ def render(task: Task, actions: np.ndarray, seed: int) -> tuple[list[np.ndarray]
         frames = []
         for action in actions:
             frames.append(np.asarray(env.render()))
-            env.step(np.clip(action, env.action_space.low, env.action_space.high))
+            env.step(np.clip(action, *action_limits(env.action_space)))
     except Exception as error:  # OpenGL's many ways to fail
         raise ValueError(
-            f"MuJoCo cannot draw here ({type(error).__name__}: {error}): set MUJOCO_GL=egl or MUJOCO_GL=osmesa, and"
-            " install that library, or leave episode.video=false."
+            f"{task.env_id} cannot be drawn here ({type(error).__name__}: {error}): for MuJoCo, set MUJOCO_GL=egl or"
+            " MUJOCO_GL=osmesa, and install that library, or leave episode.video=false."
         ) from error
     rate = float(env.metadata.get("render_fps", 50))
     env.close()

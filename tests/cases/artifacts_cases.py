@@ -87,6 +87,7 @@ STORABLE: dict[str, Callable[[], ActionPrior]] = {
     "policy_of_other_layers": lambda: policy_prior(*trained(hidden=(5, 6, 7), activation="elu")),
     "policy_without_layers": lambda: policy_prior(*trained(hidden=())),
     "policy_of_raw_observations": lambda: policy_prior(trained()[0], None),
+    "policy_of_discrete_actions": lambda: policy_prior(make_actor(OBS, ACTIONS, discrete=True), trained()[1]),
     "logits": lambda: ModulePrior(net(), "logits", in_keys=[("agent", "observation")]),
     "mean": lambda: ModulePrior(net(), "mean", std=torch.tensor([0.1, 0.2, 0.3])),
     "squashed": lambda: ModulePrior(

@@ -12,6 +12,7 @@ import torch
 pytest.importorskip("gymnasium")
 
 from collectors_cases import LENGTHS, collector, deterministic, gaussian, same, scripts
+from gymnasium.spaces import Discrete
 from gymnasium.vector import AutoresetMode
 from torchrl.collectors import Collector
 from torchrl.envs import GymWrapper, RewardSum, StepCounter, TransformedEnv
@@ -20,7 +21,7 @@ from torchrl.objectives.value import GAE
 
 from torchrl_priors import ActionPrior, PriorLogProb
 from torchrl_priors.collectors import RunningNorm, VectorCollector, make_vector_env
-from torchrl_priors.networks import make_critic
+from torchrl_priors.networks import make_actor, make_critic
 
 
 class TestEpisodes:
@@ -198,6 +199,16 @@ class TestErrors:
         with pytest.raises(ValueError, match="make_vector_env"):
             collector(env=scripts(*LENGTHS, autoreset_mode=mode))
 
-    def test_discrete_actions_are_refused(self) -> None:
+    def test_actions_that_are_counted_from_1_are_refused(self) -> None:
+        env = make_vector_env("CartPole-v1", 3)
+        env.single_action_space = Discrete(2, start=1)
         with pytest.raises(TypeError, match="action space"):
-            collector(env=make_vector_env("CartPole-v1", 3))
+            collector(env=env)
+
+
+def test_a_discrete_policy_acts_by_indices() -> None:
+    policy = make_actor(4, 2, in_key="observation", discrete=True)
+    batch = VectorCollector(make_vector_env("CartPole-v1", 3), policy, frames_per_batch=60, seed=0).rollout()
+    assert set(batch["action"].unique().tolist()) == {0, 1}
+    log_prob = policy.get_dist(batch.copy()).log_prob(batch["action"])
+    torch.testing.assert_close(batch["action_log_prob"], log_prob)

@@ -191,7 +191,10 @@ class TestEnvState:
     @pytest.mark.parametrize(
         ("env", "message"),
         [
-            (lambda: make_vector_env("Pendulum-v1", 2), "Pendulum-v1 is not a MuJoCo"),
+            (
+                lambda: SyncVectorEnv([lambda: gymnasium.make("Pendulum-v1")], autoreset_mode=AutoresetMode.DISABLED),
+                "Pendulum-v1 is not a MuJoCo",
+            ),
             (lambda: scripts((3,), (3,)), "Script is not a MuJoCo"),
             (
                 lambda: SyncVectorEnv(

@@ -49,12 +49,12 @@ VALUES = NUMBERS | WORDS | st.none() | st.booleans() | st.text(max_size=8) | st.
 
 
 def refusal(name: str, key: str, value: Any) -> str | None:
-    """What a user reads who sets this; other errors than the two that are shown without a traceback pass through."""
+    """What a user reads who sets this; other errors than those that are shown without a traceback pass through."""
     config = CONFIGS[name].copy()
     try:
         OmegaConf.update(config, key, value)
         CHECKS[name](config)
-    except (OmegaConfBaseException, ValueError) as error:
+    except (OmegaConfBaseException, ValueError, OSError) as error:
         return str(error)
     return None
 

@@ -1,4 +1,4 @@
-"""The exact state of vectors of MuJoCo environments."""
+"""The exact state of vectors of environments: MuJoCo's, and those that keep a log of their episode."""
 
 from __future__ import annotations
 
@@ -25,18 +25,24 @@ def env_state_dict(env: VectorEnv) -> dict[str, Any]:
     * the state of its random numbers;
     * the numbers and arrays among the attributes of the environment and its wrappers (elapsed steps, ...).
 
+    Of environments that are none of MuJoCo's, and that :func:`make_vector_env` made, it is how their episode began and
+    its actions, which are played again; see :class:`~torchrl_priors.collectors.episode_log.EpisodeLog`.
+
     Args:
-        env (VectorEnv): a :class:`gymnasium.vector.SyncVectorEnv` of MuJoCo environments, between steps, with no
-            episode that ended and was not reset.
+        env (VectorEnv): a :class:`gymnasium.vector.SyncVectorEnv`, between steps, with no episode that ended and was
+            not reset.
 
     Returns:
-        dict: ``"physics"``, a float64 tensor ``[num_envs, numbers]``, and ``"attributes"``, a list of JSON texts.
+        dict: ``"physics"``, a float64 tensor ``[num_envs, numbers]``, and ``"attributes"``, a list of JSON texts; or
+        ``"episodes"``, a list of JSON texts.
 
     Raises:
         TypeError: an environment that is none of MuJoCo's, or a wrapper that keeps something else than numbers and
             arrays; named in the message.
     """
     envs = _sub_envs(env)
+    if not is_mujoco(envs[0]):
+        return {"episodes": [json.dumps({"identity": _identity(sub), **sub.episode()}) for sub in envs]}
     return {
         "physics": torch.from_numpy(np.stack([_physics(sub) for sub in envs])),
         "attributes": [json.dumps(_attributes(sub)) for sub in envs],
@@ -48,18 +54,26 @@ def load_env_state_dict(env: VectorEnv, state_dict: Mapping[str, Any]) -> None:
 
     Raises:
         TypeError: see :func:`env_state_dict`.
-        ValueError: the state is that of another number or kind of environments.
+        ValueError: the state is that of another number or kind of environments; or the actions of an episode that is
+            played again lead elsewhere.
     """
     envs = _sub_envs(env)
-    physics, attributes = state_dict["physics"].cpu().numpy(), [json.loads(text) for text in state_dict["attributes"]]
+    attributes = [json.loads(text) for text in state_dict.get("attributes", state_dict.get("episodes"))]
     if len(attributes) != len(envs):
         raise ValueError(f"The state is that of {len(attributes)} environments, there are {len(envs)}.")
-    for sub, saved, numbers in zip(envs, attributes, physics, strict=True):
+    for sub, saved in zip(envs, attributes, strict=True):
         for what, value in _identity(sub).items():
             if saved["identity"].get(what) != value:
                 raise ValueError(
                     f"The state is that of another environment: {what} {saved['identity'].get(what)}, not {value}."
                 )
+    if not is_mujoco(envs[0]):
+        env.reset()
+        for sub, saved in zip(envs, attributes, strict=True):
+            sub.play_again(saved)
+        return
+    physics = state_dict["physics"].cpu().numpy()
+    for sub, numbers in zip(envs, physics, strict=True):
         if numbers.shape != _physics(sub).shape:
             raise ValueError("The state is that of another model, or of another version of MuJoCo.")
     env.reset()  # the vector's and the wrappers' own bookkeeping, as of environments within an episode
@@ -68,9 +82,18 @@ def load_env_state_dict(env: VectorEnv, state_dict: Mapping[str, Any]) -> None:
         _set_physics(sub, numbers)
 
 
+def is_mujoco(env: gymnasium.Env) -> bool:
+    """Whether the state of an environment is that of MuJoCo's simulator."""
+    base = env.unwrapped
+    kinds = (type(getattr(base, "model", None)).__name__, type(getattr(base, "data", None)).__name__)
+    return kinds == ("MjModel", "MjData")
+
+
 def _sub_envs(env: VectorEnv) -> list[gymnasium.Env]:
-    """The environments of a vector, all of them MuJoCo's."""
+    """The environments of a vector, all of them MuJoCo's, or with a log of their episode."""
     from gymnasium.vector import SyncVectorEnv
+
+    from torchrl_priors.collectors.episode_log import EpisodeLog
 
     if not isinstance(env, SyncVectorEnv):
         raise TypeError(
@@ -78,10 +101,11 @@ def _sub_envs(env: VectorEnv) -> list[gymnasium.Env]:
         )
     for sub in env.envs:
         base = sub.unwrapped
-        kinds = (type(getattr(base, "model", None)).__name__, type(getattr(base, "data", None)).__name__)
-        if kinds != ("MjModel", "MjData"):
+        if not is_mujoco(sub) and not isinstance(sub, EpisodeLog):
             name = type(base).__name__ if base.spec is None else base.spec.id
-            raise TypeError(f"{name} is not a MuJoCo environment: its state cannot be saved.")
+            raise TypeError(
+                f"{name} is not a MuJoCo environment: its state cannot be saved, but where make_vector_env made it."
+            )
     return list(env.envs)
 
 

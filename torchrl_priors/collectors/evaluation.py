@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchrl_priors.collectors.policy_step import policy_step
 from torchrl_priors.collectors.running_norm import RunningNorm
-from torchrl_priors.collectors.vector_env import check_vector_env, spread_seed
+from torchrl_priors.collectors.vector_env import action_limits, check_vector_env, spread_seed
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -71,7 +71,7 @@ def evaluate(
     )
     env_seeds, action_seed = spread_seed(seed, env.num_envs, stream=1)
     generator = torch.Generator(device).manual_seed(action_seed)
-    low, high = env.single_action_space.low, env.single_action_space.high
+    low, high = action_limits(env.single_action_space)
 
     returns, lengths = np.zeros(episodes), np.zeros(episodes, np.int64)
     current = np.arange(env.num_envs)  # the episode that each environment plays

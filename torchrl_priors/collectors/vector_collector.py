@@ -15,7 +15,7 @@ from torchrl_priors.collectors.env_state import env_state_dict, load_env_state_d
 from torchrl_priors.collectors.interface import CollectorInterface
 from torchrl_priors.collectors.policy_step import policy_step
 from torchrl_priors.collectors.running_norm import RunningNorm
-from torchrl_priors.collectors.vector_env import check_vector_env, spread_seed
+from torchrl_priors.collectors.vector_env import action_limits, check_vector_env, spread_seed
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -43,8 +43,8 @@ class VectorCollector(CollectorInterface):
     ``episode_reward`` and ``step_count``. Every batch has memory of its own.
 
     Args:
-        env (VectorEnv): environments of real observations and actions that do not reset by themselves, see
-            :func:`make_vector_env`.
+        env (VectorEnv): environments that do not reset by themselves, see :func:`make_vector_env`: their observations
+            are arrays, their actions arrays of real numbers, or ``Discrete`` and given by their indices.
         policy (TensorDictModuleBase): usually a :class:`~torchrl.modules.ProbabilisticActor`; reads the observation or
             its normalised form.
 
@@ -63,7 +63,7 @@ class VectorCollector(CollectorInterface):
     Raises:
         ValueError: numbers of frames that do not divide, a policy that reads what there is not, or an environment that
             resets by itself.
-        TypeError: spaces of other than real numbers.
+        TypeError: other spaces.
 
     Examples:
         >>> import torch
@@ -114,7 +114,7 @@ class VectorCollector(CollectorInterface):
         inputs = [observation_key] if normalizer is None else [observation_key, normalized_key]
         self._step = policy_step(policy, action_key, inputs)
         self._generator = torch.Generator(self.device)
-        self._low, self._high = env.single_action_space.low, env.single_action_space.high
+        self._low, self._high = action_limits(env.single_action_space)
         self._obs = np.empty((env.num_envs, *env.single_observation_space.shape), np.float32)
         self.set_seed(seed)
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictModule
 from torch import nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torch.distributions import Categorical
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from torchrl_priors.collectors.running_norm import RunningNorm
 from torchrl_priors.networks import GaussianMLP
@@ -46,35 +49,42 @@ def policy_prior(
         (['observation'], [('prior', 'loc'), ('prior', 'scale')])
     """
     net = _find_net(actor)
+    discrete = isinstance(net, MLP)
+    obs_dim = net.in_features if discrete else net.obs_dim
     first: nn.Module
     if normalizer is None:
-        first = TeacherInput((net.obs_dim,), flatten=False)
+        first = TeacherInput((obs_dim,), flatten=False)
     elif not isinstance(normalizer, RunningNorm):
         raise TypeError(f"The statistics of a policy are those of a RunningNorm, got {type(normalizer).__name__}.")
-    elif tuple(normalizer.shape) != (net.obs_dim,):
+    elif tuple(normalizer.shape) != (obs_dim,):
         raise ValueError(
-            f"The policy reads observations of shape ({net.obs_dim},), and its statistics are of shape"
+            f"The policy reads observations of shape ({obs_dim},), and its statistics are of shape"
             f" {tuple(normalizer.shape)}."
         )
     else:
         first = normalizer
-    return ModulePrior(nn.Sequential(first, net), "mean_std", in_keys=[in_key], namespace=namespace)
+    return ModulePrior(
+        nn.Sequential(first, net), "logits" if discrete else "mean_std", in_keys=[in_key], namespace=namespace
+    )
 
 
-def _find_net(actor: ProbabilisticActor) -> GaussianMLP:
+def _find_net(actor: ProbabilisticActor) -> Any:
     """The network of an actor of :func:`~torchrl_priors.networks.make_actor`, if it is one and nothing else."""
     modules = list(actor.modules())
     nets = [module for module in modules if isinstance(module, GaussianMLP)]
+    kind: Any = IndependentNormal
+    if not nets:
+        nets, kind = [module for module in modules if isinstance(module, MLP)], Categorical
     heads = [module for module in modules if isinstance(module, ProbabilisticTensorDictModule)]
     if (
         len(nets) != 1
         or len(heads) != 1
-        or heads[0].distribution_class is not IndependentNormal
+        or heads[0].distribution_class is not kind
         or heads[0].distribution_kwargs
         or len(list(actor.state_dict())) != len(nets[0].state_dict())
     ):
         raise TypeError(
             f"Expected an actor of torchrl_priors.networks.make_actor, got a {type(actor).__name__} with {len(nets)}"
-            " GaussianMLP and other parts. A ModulePrior takes any network, and an ActionPrior any actor."
+            " such networks and other parts. A ModulePrior takes any network, and an ActionPrior any actor."
         )
     return nets[0]
