@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from tqdm import tqdm
 
 from recipes.common.checkpoints import Checkpoints
 from recipes.common.loggers import RunLogger
+from recipes.common.preemption import Notice
 from recipes.common.progress import progress_bar
 from recipes.common.run_folder import RunFolder, digest, read_json
 from recipes.common.schedules import without_idle
@@ -183,7 +183,7 @@ class Run:
             self.checkpoints.save(students.parts(), frames)
             self.set_status("running", frames=frames)
         if self.is_to_stop and frames < self.cfg.total_frames:
-            raise Stopped(f"{self.folder.path}: asked to stop (SIGTERM), saved at {frames} frames")
+            raise Stopped(f"{self.folder.path}: asked to stop, saved at {frames} frames")
 
     def finish(self, actor: Any, normalizer: Any, env_id: str, arm: str | None = None) -> None:
         """Export the policy as a teacher, and say that the run is done."""
@@ -222,26 +222,25 @@ class Supervisor:
     """Why it failed, in a sweep, whose other runs go on."""
 
     def __enter__(self) -> Supervisor:
-        self._before: Any = None
-        with suppress(ValueError):  # not the main thread
-            self._before = signal.signal(signal.SIGTERM, self._stop)
+        self._notice = Notice(self._stop)
         return self
 
     def _stop(self, *_: Any) -> None:
         """What a cluster sends before it takes the machine away: the run is saved after the rollout at hand."""
         if self.run is None:
-            sys.exit(143)
+            self._notice.leave(143)
         self.run.is_to_stop = True
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback_: Any) -> bool:
-        if self._before is not None:
-            signal.signal(signal.SIGTERM, self._before)
+        self._notice.release()
         if isinstance(error, (KeyboardInterrupt, Stopped)):
             interrupted = isinstance(error, KeyboardInterrupt)
             self._end("interrupted")
             said = "Interrupted" if interrupted else error
             print(f"{said}: the same command continues.", file=sys.stderr, flush=True)
-            sys.exit(130 if interrupted else 143)
+            if interrupted:
+                sys.exit(130)
+            self._notice.leave(143)
         if isinstance(error, Exception):
             self._end("failed", error=str(error))
             if not isinstance(error, (ValueError, OSError, ImportError, TrainingError)):

@@ -73,7 +73,7 @@ def make_batch(kind="categorical", batch=(6,), observation="observation"):
                 observation: torch.randn(*batch, OBS),
                 "reward": torch.randn(*batch, 1),
                 "shaped_reward": torch.randn(*batch, 1),
-                "prior_bonus": torch.randn(*batch, 1),
+                "prior_bonus": torch.zeros(*batch, 1),  # that of no method in particular
                 "terminated": terminated,
                 "done": terminated.clone(),
                 "prior_log_prob": log_prob.masked_fill(terminated, 0.0),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
@@ -61,6 +63,26 @@ def sweep(folder: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[st
     command = [sys.executable, "nothing.py", "-m", *arguments]
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     return result, {file.name: file.read_text().split() for file in sorted((folder / "out").iterdir())}
+
+
+def at_work(out: Path, progress: str) -> dict[int, Path]:
+    """The processes that hold the folder of a run that has some file, and the folder of each: of Linux only."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            held = {os.readlink(file) for file in process.glob("fd/*")}
+        except OSError:  # another user's, or it has ended
+            continue
+        for folder in out.glob("*"):
+            if str(folder / ".lock") in held and [*folder.glob(progress)]:
+                found[int(process.name)] = folder
+    return found
+
+
+def wait_for(something: Callable[[], object], process: subprocess.Popen) -> None:
+    while not something():
+        assert process.poll() is None, "the sweep ended"
+        time.sleep(0.02)
 
 
 def results(run: Path) -> dict[str, bytes]:

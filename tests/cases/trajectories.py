@@ -44,7 +44,7 @@ def actor() -> ProbabilisticTensorDictSequential:
     return tabular_actor(ACTOR_TABLE)
 
 
-def trajectories(*shape: int, seed: int = 0, ends: float = 0.3, ids: bool = False) -> TensorDict:
+def trajectories(*shape: int, seed: int = 0, ends: float = 0.3, ids: bool = False, time_dim: int = -1) -> TensorDict:
     """Random steps. The next state of a step that goes on is the state of the next step, as in what is collected."""
     generator = torch.Generator().manual_seed(seed)
 
@@ -66,6 +66,11 @@ def trajectories(*shape: int, seed: int = 0, ends: float = 0.3, ids: bool = Fals
     )
     if ids:  # they change at some steps that are not done: seams
         batch["collector", "traj_ids"] = torch.randint(2, shape, generator=generator)
+    goes_on = ~batch["next", "done"].squeeze(-1)
+    if ids:
+        goes_on &= batch["collector", "traj_ids"] == batch["collector", "traj_ids"].roll(-1, time_dim)
+    goes_on.select(time_dim, -1).fill_(False)
+    batch["next", "state"] = torch.where(goes_on, batch["state"].roll(-1, time_dim), batch["next", "state"])
     return batch
 
 

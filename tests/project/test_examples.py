@@ -26,6 +26,8 @@ def run(name: str, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_example_runs_and_prints_returns(name: str, monkeypatch: pytest.MonkeyPatch, capsys, tmp_path: Path) -> None:
     pytest.importorskip("gymnasium")
+    if name == "ray_collector.py":
+        pytest.importorskip("ray")
     monkeypatch.chdir(tmp_path)
     option = "frames=" if name == "from_yaml.py" else "--frames="
     run(name, monkeypatch, f"{option}{FRAMES.get(name, 2048)}")

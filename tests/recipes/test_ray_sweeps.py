@@ -7,8 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,10 @@ pytest.importorskip("ray")
 pytest.importorskip("mujoco")
 import ray
 from mujoco_cases import ROOT, TINY, run
-from sweep_cases import results, sweep
+from sweep_cases import at_work, results, sweep, wait_for
+
+#: Where a run is that has one to go on from.
+CHECKPOINT = "checkpoints/*.sha256.json"
 
 
 @pytest.fixture(scope="module")
@@ -51,29 +53,9 @@ def test_runs_that_fail_or_die_again_and_again_are_listed_and_the_others_end(clu
     assert "Failed: seed=1: Error: Ray lost the run (WorkerCrashedError, max_retries=0)" in result.stderr
 
 
-def at_work(out: Path) -> dict[int, Path]:
-    """The processes that hold the folder of a run that has a checkpoint, and the folder of each."""
-    found = {}
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            held = {os.readlink(file) for file in process.glob("fd/*")}
-        except OSError:  # another user's, or it has ended
-            continue
-        for folder in out.glob("*"):
-            if str(folder / ".lock") in held and [*folder.glob("checkpoints/*.sha256.json")]:
-                found[int(process.name)] = folder
-    return found
-
-
-def wait_for(something: Callable[[], object], process: subprocess.Popen) -> None:
-    while not something():
-        assert process.poll() is None, "the sweep ended"
-        time.sleep(0.02)
-
-
 def kill_one(out: Path) -> bool:
     """End a run that is not finished by force."""
-    for process, folder in at_work(out).items():
+    for process, folder in at_work(out, CHECKPOINT).items():
         try:
             os.kill(process, signal.SIGSTOP)
             running = json.loads((folder / "status.json").read_text())["state"] == "running"
@@ -96,7 +78,7 @@ def test_a_sweep_that_is_interrupted_and_whose_run_is_killed_gives_what_single_r
         return subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
 
     first = start()
-    wait_for(lambda: at_work(out), first)
+    wait_for(lambda: at_work(out, CHECKPOINT), first)
     os.killpg(first.pid, signal.SIGINT)  # Ctrl-C reaches all processes of the terminal
     said = [line for line in first.communicate()[1].splitlines() if "raylet" not in line]
     assert said[-1:] == ["Interrupted: the same command continues."]

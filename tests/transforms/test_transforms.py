@@ -74,7 +74,7 @@ class TestShift:
         self, shape: list[int], time_dim: int, seed: int, ends: float, ids: bool, boundary: Any
     ) -> None:
         time_dim %= len(shape)
-        batch = trajectories(*shape, seed=seed, ends=ends, ids=ids)
+        batch = trajectories(*shape, seed=seed, ends=ends, ids=ids, time_dim=time_dim)
         expected = loop_over_time(
             batch, time_dim, lambda step: -CROSS_ENTROPY[step["next", "state"]] if boundary == "expected" else 0.0
         )
@@ -136,6 +136,7 @@ class TestShift:
             padded["next", "prior_log_prob"][1], transform(batch.clone())["next", "prior_log_prob"][1]
         )
 
+    @pytest.mark.filterwarnings("ignore:No step of the batch goes on")  # for they are not
     def test_unused_next_states_need_not_be_valid(self) -> None:
         net = nn.Linear(2, ACTIONS)
         observation = torch.randn(3, 2)
@@ -159,7 +160,8 @@ class TestShift:
 
         student, teacher = policy(), ActionPrior(policy())
         batch = trajectories(2, 5, seed=3)
-        batch["observation"], batch["next", "observation"] = torch.randn(2, 5, 2), torch.randn(2, 5, 2)
+        observation = torch.randn(2, 6, 2)
+        batch["observation"], batch["next", "observation"] = observation[:, :-1], observation[:, 1:]
         batch["action"] = student(batch.clone())["action"].detach()
         keys = set(batch.keys(True, True))
         out = PriorLogProb(teacher, student, time_dim=1, num_samples=4)(batch)
