@@ -26,7 +26,11 @@ def lower_bounds() -> dict[str, str]:
     extras = project["optional-dependencies"]
     needed = [
         *project["dependencies"],
-        *(line for name in ("artifacts", "box2d", "recipes", "mujoco", "sweeps", "test", "docs") for line in extras[name]),
+        *(
+            line
+            for name in ("artifacts", "box2d", "recipes", "mujoco", "sweeps", "test", "docs")
+            for line in extras[name]
+        ),
     ]
     found = (re.match(r"([\w-]+)(?:\[\w+\])?>=([\w.]+)", line) for line in needed)
     return dict(match.groups() for match in found if match)  # type: ignore[misc]
