@@ -79,7 +79,7 @@ def _decision(cfg: MujocoConfig, results: Sequence[TrialResult]) -> str:
     """What the trials made of the teachers, in words."""
     said = []
     for result in results:
-        sure = f"confidence {result.confidence:.1%}" if result.confidence else "in doubt"
+        sure = f"confidence {min(result.confidence, 0.999):.1%}" if result.confidence else "in doubt"
         if result.winner == ALONE:
             said.append(f"the student went on alone ({sure})")
         elif result.winner.endswith(LET_GO):

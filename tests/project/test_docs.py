@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,7 @@ def run(command: str, folder: Path) -> int | str | None:
     assert words[:2] == ["python", "-m"], f"{command}: no command that a test knows to run"
     assert words[2] in SHORT, f"{command}: no recipe that a test knows to make short"
     more = ["hydra/launcher=basic"] if "-m" in words[3:] else []
+    more += ["+env.kwargs.max_episode_steps=16"] if "env.id=" in command else []  # in 64 frames episodes are to end
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("HYDRA_MAIN_MODULE", "__main__")  # find conf/ as the command does
@@ -64,14 +66,36 @@ def test_every_block_is_of_a_language_that_is_run() -> None:
     assert {name for text in PAGES.values() for name, _ in BLOCK.findall(text)} == {"bash", "python"}
 
 
-@pytest.mark.usefixtures("without_pictures")
+# What a page's commands make.
+MADE = {
+    "guides/recipes.md": ["results/gridworld/original/area_ratio.csv", "outputs/report/report.md"],
+    "guides/own_teacher.md": [
+        f"outputs/mujoco/{name}/trial-*/teacher.json" for name in ("LunarLander-v3", "Pendulum-v1")
+    ],
+}
+
+
+@pytest.fixture
+def a_readers_teachers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The files that the pages speak of: a model of Stable-Baselines3, and the bot that a page shows."""
+    PPO = pytest.importorskip("stable_baselines3").PPO
+    PPO("MlpPolicy", "LunarLander-v3", policy_kwargs={"net_arch": [8]}, device="cpu").save(tmp_path / "ppo")
+    (tmp_path / "bot.py").write_text(
+        next(code for code in blocks("python")["guides/own_teacher.md"] if "def swing" in code)
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("bot", None)
+
+
+@pytest.mark.usefixtures("without_pictures", "a_readers_teachers")
 @pytest.mark.parametrize("page", blocks("bash"))
 def test_commands_run_in_their_order(page: str, tmp_path: Path) -> None:
     for code in blocks("bash")[page]:
         for command in code.strip().splitlines():
             assert run(command, tmp_path) in (None, 0), command
-    assert (tmp_path / "results/gridworld/original/area_ratio.csv").exists()
-    assert (tmp_path / "outputs/report/report.md").exists()
+    for made in MADE[page]:
+        assert [*tmp_path.glob(made)], made
 
 
 def names_of_the_first_page() -> dict[str, Any]:

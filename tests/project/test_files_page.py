@@ -77,6 +77,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], s
             found[key] |= names
     for name in ("none", "trial", "failed"):
         found[RUN, "status.json"] |= set(json.loads((folder / name / "status.json").read_text()))
+    kept = json.loads((folder / "trial/teacher.json").read_text())
+    parts = [*kept["teachers"].values(), *kept["students"].values(), kept["policy"]]
+    found[RUN, "teacher.json"] = set(kept).union(*parts)
     for trial in json.loads((folder / "trial/trials.json").read_text()):
         found[RUN, "trials.json"] |= set(trial)
     return found

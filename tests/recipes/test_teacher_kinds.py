@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data import Bounded
 
 pytest.importorskip("mujoco")
 pytest.importorskip("stable_baselines3")
@@ -26,7 +27,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from recipes.mujoco.agent import make_prior
 from recipes.mujoco.run import Run
 from recipes.mujoco.task import open_task
+from recipes.mujoco.teachers import ReversedPrior
 from recipes.show_weight.episode import load_agent
+from torchrl_priors import CallablePrior
 
 SHORT = ["trial.max_frames=128", "trial.min_frames=64", "total_frames=256"]
 CARTPOLE = ["env=any", "env.id=CartPole-v1", *SHORT]
@@ -165,6 +168,14 @@ def test_a_reversed_teacher_does_the_opposite(name, env, tmp_path):
         torch.testing.assert_close(bad.stddev, good.stddev)
     else:
         torch.testing.assert_close(bad.probs, good.probs.flip(-1))
+
+
+@pytest.mark.parametrize(("low", "high", "mean"), [(0.0, 1.0, 0.8), (-1.0, 1.0, -0.2), (-np.inf, np.inf, -0.2)])
+def test_a_mean_is_mirrored_at_the_middle_of_the_actions(low, high, mean):
+    actions = Bounded(torch.tensor([low]), torch.tensor([high]), dtype=torch.float32)
+    prior = ReversedPrior(CallablePrior(lambda observation: [0.2], std=0.1), actions)
+    state = TensorDict(observation=torch.zeros(1, 3), batch_size=[1])
+    assert prior.get_dist(state).mean.item() == pytest.approx(mean)
 
 
 @pytest.mark.usefixtures("_importable")
