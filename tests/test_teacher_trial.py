@@ -50,7 +50,7 @@ def test_a_clear_difference_ends_the_trial_early_in_favour_of_the_better_student
 
 
 def test_in_doubt_the_student_learns_alone():
-    trial = run(trial_of(["taught", "alone"], alone="alone", max_frames=5 * ROUND), {"alone": 0.0, "taught": 0.01})
+    trial = run(trial_of(["taught", "alone"], in_doubt="alone", max_frames=5 * ROUND), {"alone": 0.0, "taught": 0.01})
     assert trial.result.winner == "alone"
     assert trial.result.confidence == 0
     assert trial.result.frames == {"taught": 5 * ROUND, "alone": 5 * ROUND}
@@ -110,7 +110,7 @@ def test_a_saved_trial_goes_on_as_if_it_had_not_stopped():
     [
         (["alone"], {}, "at least two arms"),
         (["a", "a"], {}, "different names"),
-        (["a", "b"], {"alone": "c"}, "none of the arms"),
+        (["a", "b"], {"in_doubt": "c"}, "none of the arms"),
         (["a", "b"], {"alpha": 0.0}, "alpha"),
         (["a", "b"], {"max_frames": 0}, "max_frames"),
         (["a", "b"], {"min_episodes": 1}, "min_episodes"),

@@ -38,7 +38,8 @@ class Students:
 
     With ``method=trial`` the first trial is between the teachers. When the returns of a student with a teacher do not
     rise any more, a second one finds out whether it is better off without: a twin, whose teacher fades, against the
-    student itself. If the teacher stays, the next such trial comes when the student has made twice as many frames.
+    student itself. If the teacher stays, the next such trial comes when the student has made twice as many frames, and
+    may take twice as long: gains without a teacher are slow to show, and to let go of one can't be undone.
     """
 
     def __init__(self, cfg: MujocoConfig, task: Task) -> None:
@@ -46,18 +47,18 @@ class Students:
         self.by_arm = {arm: Student(arm_cfg, task) for arm, arm_cfg in arms(cfg).items()}
         self.chosen = next(iter(self.by_arm))
         """Whose policy is the run's: the last winner's; before there is one, that of the student alone."""
-        self.trial = self._trial(list(self.by_arm)) if len(self.by_arm) > 1 else None
         self.results: list[TrialResult] = []
+        self.trial = self._trial(list(self.by_arm)) if len(self.by_arm) > 1 else None
         self.frames = 0
         """Of all students together."""
         self._patience = 0
 
     def _trial(self, arms: list[str]) -> TeacherTrial:
-        """In doubt without a teacher: gains that are to come come without it."""
-        (alone,) = (arm for arm in arms if arm == ALONE or arm.endswith(LET_GO))
+        """In doubt the first one goes on: the student alone, or the one that a twin tries to better."""
         trial = self.cfg.trial
         options: dict[str, Any] = {"alpha": trial.alpha, "recent": trial.recent, "min_frames": trial.min_frames}
-        return TeacherTrial(arms, max_frames=trial.max_frames, alone=alone, **options)
+        before = sum(arm.endswith(LET_GO) for result in self.results for arm in result.frames)
+        return TeacherTrial(arms, max_frames=trial.max_frames * 2**before, in_doubt=arms[0], **options)
 
     def round(self) -> Iterator[tuple[str, dict[str, Tensor], Tensor | None]]:
         """Train each student that is still in on one rollout; its name, what was measured, and the prior weights.

@@ -95,10 +95,11 @@ def standing_still(teachers) -> list[str]:
 
 def test_a_student_that_stands_still_is_tried_without_its_teacher(standing_still, tmp_path, monkeypatch):
     monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 256))
+    kept, twin = "kickstart", "kickstart, let go"
+    always(monkeypatch, twin)
     out = run(tmp_path, *standing_still, "total_frames=640")
     rows = pd.read_csv(out / "metrics.csv")
-    kept, twin = "kickstart", "kickstart, let go"
-    assert rows["arm"].tolist() == [*[kept] * 4, *[kept, twin] * 2, *[twin] * 2]  # in doubt without the teacher
+    assert rows["arm"].tolist() == [*[kept] * 4, *[kept, twin] * 2, *[twin] * 2]
     assert winner(out) == twin
     both = rows.iloc[4:6]
     assert both["episode_return"].nunique(dropna=False) == 1  # the twin begins in the very state of the student
@@ -106,15 +107,17 @@ def test_a_student_that_stands_still_is_tried_without_its_teacher(standing_still
     assert rows["frames"].tolist() == list(range(64, 641, 64))
 
 
-def test_a_teacher_that_stays_is_tried_again_after_twice_the_frames(standing_still, tmp_path, monkeypatch):
+def test_a_teacher_stays_in_doubt_and_is_tried_again_after_twice_the_frames_for_twice_as_long(
+    standing_still, tmp_path, monkeypatch
+):
     monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 128))
-    always(monkeypatch, "kickstart")
-    out = run(tmp_path, *standing_still, "total_frames=768")
+    out = run(tmp_path, *standing_still, "trial.alpha=1e-9", "total_frames=1024")
     rows = pd.read_csv(out / "metrics.csv")
     kept, twin = "kickstart", "kickstart, let go"
-    # after 2 rollouts a trial of 2; after one more, more than 4 of its own, another one
-    assert rows["arm"].tolist() == [*[kept] * 2, *[kept, twin] * 2, kept, *[kept, twin] * 2, kept]
-    assert [result["winner"] for result in json.loads((out / "trials.json").read_text())] == [kept, kept]
+    # after 2 rollouts a trial of 2; after one more, more than 4 of its own, one of 4
+    assert rows["arm"].tolist() == [*[kept] * 2, *[kept, twin] * 2, kept, *[kept, twin] * 4, kept]
+    results = json.loads((out / "trials.json").read_text())
+    assert [(result["winner"], result["confidence"]) for result in results] == [(kept, 0), (kept, 0)]
 
 
 @pytest.mark.parametrize("stop", [256, 384, 576])  # before, in and after the trial with the twin
