@@ -26,7 +26,8 @@ def env_state_dict(env: VectorEnv) -> dict[str, Any]:
     * the numbers and arrays among the attributes of the environment and its wrappers (elapsed steps, ...).
 
     Of environments that are none of MuJoCo's, and that :func:`make_vector_env` made, it is how their episode began and
-    its actions, which are played again; see :class:`~torchrl_priors.collectors.episode_log.EpisodeLog`.
+    its actions, which are played again. So an episode is to depend on Gymnasium's random numbers (``np_random``) and
+    the actions only.
 
     Args:
         env (VectorEnv): a :class:`gymnasium.vector.SyncVectorEnv`, between steps, with no episode that ended and was

@@ -18,7 +18,7 @@ class EpisodeLog(gymnasium.Wrapper):
     random numbers, or a memory beyond the episode, end up elsewhere, and :meth:`play_again` says so.
 
     Args:
-        env (gymnasium.Env): of arrays as observations.
+        env (Env): of arrays as observations.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:
@@ -28,14 +28,14 @@ class EpisodeLog(gymnasium.Wrapper):
         self._observation = np.empty(0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Any]:
-        """See :class:`gymnasium.Env`."""
+        """As of any environment."""
         self._begin = {"random": self._random()} if seed is None else {"seed": seed}
         self._actions = []
         self._observation, info = self.env.reset(seed=seed, options=options)
         return self._observation, info
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
-        """See :class:`gymnasium.Env`."""
+        """As of any environment."""
         self._actions.append(np.array(action))  # what is given is written again
         self._observation, *rest = self.env.step(action)
         return self._observation, *rest

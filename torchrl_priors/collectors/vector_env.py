@@ -21,8 +21,7 @@ def make_vector_env(env_id: str, num_envs: int, **kwargs: Any) -> SyncVectorEnv:
 
     HalfCheetah, Hopper, Walker2d, Ant and Humanoid (v4, v5) take the same steps, to the bit, faster: observations,
     rewards and ends are computed for all environments at once, and the infos of steps are empty. Environments that are
-    none of MuJoCo's are put into an :class:`~torchrl_priors.collectors.episode_log.EpisodeLog`, so that their state can
-    be saved.
+    none of MuJoCo's keep a log of their episode, by which :func:`env_state_dict` saves their state.
 
     The models of some environments use features that MuJoCo deprecates. These notices, which MuJoCo would print and
     append to a file in the working directory, are dropped while the environments are built; its other warnings become
