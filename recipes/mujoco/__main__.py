@@ -36,10 +36,10 @@ def with_env(words: list[str]) -> list[str]:
 
     Examples:
         >>> with_env(["env.id=LunarLander-v3", "seed=1"])
-        ['env=any', 'env.id=LunarLander-v3', 'seed=1']
+        ['env.id=LunarLander-v3', 'seed=1', 'env=any']
     """
     by_id = any(re.match(r"env\.id=.*-v\d", word) for word in words)
-    return ["env=any", *words] if by_id and not any(word.startswith("env=") for word in words) else words
+    return [*words, "env=any"] if by_id and not any(word.startswith("env=") for word in words) else words
 
 
 if __name__ == "__main__":

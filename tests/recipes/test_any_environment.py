@@ -116,7 +116,7 @@ def test_the_trial_is_the_method_where_there_is_a_teacher_and_none_is_given(taug
     ],
 )
 def test_an_id_with_its_version_chooses_the_settings_of_an_unknown_environment(words, chosen):
-    assert with_env(words) == (["env=any", *words] if chosen else words)
+    assert with_env(words) == ([*words, "env=any"] if chosen else words)
 
 
 def test_the_table_says_what_the_teacher_was_worth(taught, tmp_path, capsys):
