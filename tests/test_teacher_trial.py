@@ -50,10 +50,19 @@ def test_a_clear_difference_ends_the_trial_early_in_favour_of_the_better_student
 
 
 def test_in_doubt_the_student_learns_alone():
-    trial = run(trial_of(["taught", "alone"], in_doubt="alone", max_frames=5 * ROUND), {"alone": 0.0, "taught": 0.01})
+    trial = run(trial_of(["alone", "taught"], max_frames=5 * ROUND), {"alone": 0.0, "taught": 0.1})
+    returns = trial.result.returns
     assert trial.result.winner == "alone"
+    assert trial.result.margin == returns["alone"] - returns["taught"] < 0
     assert trial.result.confidence == 0
     assert trial.result.frames == {"taught": 5 * ROUND, "alone": 5 * ROUND}
+
+
+def test_in_doubt_the_student_with_the_higher_returns_goes_on_where_that_is_asked_for():
+    trial = trial_of(["alone", "taught"], in_doubt="best", max_frames=5 * ROUND)
+    result = run(trial, {"alone": 0.0, "taught": 0.1}).result
+    assert (result.winner, result.confidence) == ("taught", 0)
+    assert result.margin > 0
 
 
 def test_arms_that_fall_behind_leave_and_the_best_teacher_wins():
@@ -110,7 +119,7 @@ def test_a_saved_trial_goes_on_as_if_it_had_not_stopped():
     [
         (["alone"], {}, "at least two arms"),
         (["a", "a"], {}, "different names"),
-        (["a", "b"], {"in_doubt": "c"}, "none of the arms"),
+        (["a", "b"], {"in_doubt": "a"}, "first"),
         (["a", "b"], {"alpha": 0.0}, "alpha"),
         (["a", "b"], {"max_frames": 0}, "max_frames"),
         (["a", "b"], {"min_episodes": 1}, "min_episodes"),

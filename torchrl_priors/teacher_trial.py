@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -51,15 +51,16 @@ class TeacherTrial:
 
     Welch's statistic. The pairs of arms and the looks that ``max_frames`` leaves room for, :math:`L` in all, share the
     level :math:`\alpha` (Bonferroni). An arm that is behind any other leaves the trial. The trial ends when one arm is
-    left, or at ``max_frames`` of each arm. Then ``in_doubt`` wins if it is still in the trial, else the arm with the
-    highest recent return.
+    left, or at ``max_frames`` of each arm. Then, in doubt, the first arm wins if it is still in the trial, else the one
+    with the highest recent return.
 
     Args:
-        arms (sequence of str): names of the students, at least two.
+        arms (sequence of str): names of the students, at least two, the one without a teacher first.
 
     Keyword Args:
         max_frames (int): of each arm.
-        in_doubt (str): the arm that wins in doubt. Defaults to the first one: name the student without a teacher first.
+        in_doubt (str): who wins in doubt, ``"first"`` or ``"best"``: the first arm, or always the one with the highest
+            recent return. Defaults to ``"first"``.
         alpha (float): probability of dropping an arm though it is no worse. Defaults to 0.05.
         min_frames (int, optional): of each arm before the first decision. Learning curves cross, and a test can't see
             that: on Hopper the student of a bad teacher leads at 4096 frames and is clearly behind at 24576. Defaults
@@ -71,7 +72,7 @@ class TeacherTrial:
         done_key (NestedKey): where episodes end, bool ``[*B, 1]``. Defaults to ``("next", "done")``.
 
     Raises:
-        ValueError: fewer than two arms, a name twice, an unknown ``in_doubt``, or a number out of its range.
+        ValueError: fewer than two arms, a name twice, or a setting out of its range.
 
     Examples:
         >>> import torch
@@ -96,7 +97,7 @@ class TeacherTrial:
         arms: Sequence[str],
         *,
         max_frames: int,
-        in_doubt: str | None = None,
+        in_doubt: Literal["first", "best"] = "first",
         alpha: float = 0.05,
         min_frames: int | None = None,
         recent: float = 0.25,
@@ -107,9 +108,9 @@ class TeacherTrial:
         self.arms = list(arms)
         if len(self.arms) < 2 or len(set(self.arms)) < len(self.arms):
             raise ValueError(f"A trial needs at least two arms of different names, got {self.arms}.")
-        self.in_doubt = self.arms[0] if in_doubt is None else in_doubt
-        if self.in_doubt not in self.arms:
-            raise ValueError(f"in_doubt={self.in_doubt!r} is none of the arms {self.arms}.")
+        if in_doubt not in ("first", "best"):
+            raise ValueError(f"in_doubt must be 'first' or 'best', got {in_doubt!r}.")
+        self.in_doubt = in_doubt
         if not 0 < alpha < 1:
             raise ValueError(f"alpha must be in (0, 1), got {alpha}.")
         for name, number, least in (("max_frames", max_frames, 1), ("min_episodes", min_episodes, 2)):
@@ -197,7 +198,7 @@ class TeacherTrial:
     def _end(self, recent: Mapping[str, Tensor], confidence: float) -> None:
         means = {arm: float(values.mean()) for arm, values in recent.items()}
         best = max(self.active, key=means.__getitem__)
-        winner = self.in_doubt if self.in_doubt in self.active else best
+        winner = self.arms[0] if self.in_doubt == "first" and self.arms[0] in self.active else best
         margin = means[winner] - max(value for arm, value in means.items() if arm != winner)
         returns = {arm: float(self.recent_returns(arm).mean()) for arm in self.arms}
         self.result = TrialResult(winner, margin, confidence, dict(self.frames), returns)

@@ -54,11 +54,12 @@ class Students:
         self._patience = 0
 
     def _trial(self, arms: list[str]) -> TeacherTrial:
-        """In doubt the first one goes on: the student alone, or the one that a twin tries to better."""
+        """In doubt about teachers the student alone goes on; about letting go, who has the higher returns."""
         trial = self.cfg.trial
         options: dict[str, Any] = {"alpha": trial.alpha, "recent": trial.recent, "min_frames": trial.min_frames}
         before = sum(arm.endswith(LET_GO) for result in self.results for arm in result.frames)
-        return TeacherTrial(arms, max_frames=trial.max_frames * 2**before, in_doubt=arms[0], **options)
+        options["in_doubt"] = "first" if arms[0] == ALONE else "best"
+        return TeacherTrial(arms, max_frames=trial.max_frames * 2**before, **options)
 
     def round(self) -> Iterator[tuple[str, dict[str, Tensor], Tensor | None]]:
         """Train each student that is still in on one rollout; its name, what was measured, and the prior weights.

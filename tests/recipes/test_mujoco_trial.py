@@ -107,7 +107,7 @@ def test_a_student_that_stands_still_is_tried_without_its_teacher(standing_still
     assert rows["frames"].tolist() == list(range(64, 641, 64))
 
 
-def test_a_teacher_stays_in_doubt_and_is_tried_again_after_twice_the_frames_for_twice_as_long(
+def test_a_teacher_that_stays_is_tried_again_after_twice_the_frames_for_twice_as_long(
     standing_still, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 128))
