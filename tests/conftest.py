@@ -12,7 +12,7 @@ import torch
 from hypothesis import settings
 
 with contextlib.suppress(ImportError):
-    # absl (TensorBoard's and rliable's) remembers the sys.stderr of its import, which here is pytest's, and closes it
+    # absl (TensorBoard's) remembers the sys.stderr of its import, which here is pytest's, and closes it
     # when Hydra sets up logging while a test captures: give it one that nobody closes.
     from absl.logging import get_absl_handler
 

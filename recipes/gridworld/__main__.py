@@ -20,8 +20,10 @@ def main(cfg: GridworldConfig) -> str | None:
     try:
         check(cfg)
         folder = open_folder(cfg)
-        results = run_study(cfg, folder)
-        report(cfg, folder, results)
+        try:
+            report(cfg, folder, run_study(cfg, folder))
+        finally:
+            folder.release()
     except (ValueError, OSError) as error:
         return fail(f"Error: {error}")
     return None

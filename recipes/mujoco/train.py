@@ -28,6 +28,7 @@ def run(cfg: MujocoConfig) -> str | None:
             supervisor.run = run
             train(cfg, task, run)
         print(worth_of(run.folder), end="\n" if cfg.method != "none" else "", flush=True)
+        run.folder.release()
     return supervisor.error
 
 

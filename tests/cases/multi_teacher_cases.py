@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from test_objectives_training import Signs
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives.value import GAE
 
@@ -13,7 +13,7 @@ from torchrl_priors import ClipPPOPriorLoss, MultiTeacherLoss, Prior, PriorWeigh
 
 
 def train(
-    env: Signs, actor: ProbabilisticActor, priors: list[Prior], *, method: str = "ae2r", batches: int = 8
+    env: EnvBase, actor: ProbabilisticActor, priors: list[Prior], *, method: str = "ae2r", batches: int = 8
 ) -> list[PriorWeight]:
     """PPO with an AE2R loss for each teacher; the weights of the teachers."""
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-EXTRAS = ("gymnasium", "hydra", "matplotlib", "mujoco", "omegaconf", "pandas", "rliable", "safetensors", "tqdm")
+EXTRAS = ("gymnasium", "hydra", "matplotlib", "mujoco", "omegaconf", "pandas", "safetensors", "tqdm")
 
 IMPORT_WITHOUT = """
 import sys

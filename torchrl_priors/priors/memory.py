@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import torch
@@ -34,7 +34,10 @@ def _kept(module: nn.Module) -> dict[str, Any]:
     """What a network keeps between two calls: its buffers, and what TorchScript assigns to its modules."""
     kept: dict[str, Any] = dict(module.named_buffers())
     scripts = {path: child for path, child in module.named_modules() if isinstance(child, torch.jit.ScriptModule)}
-    graphs: list[Any] = [child.graph for child in scripts.values() if child._c._has_method("forward")]
+    graphs: list[Any] = []
+    for child in scripts.values():
+        with suppress(RuntimeError):  # a module without a forward method
+            graphs.append(child.graph)
     assigned = {node.s("name") for graph in graphs for node in graph.findAllNodes("prim::SetAttr")}
     for path, child in scripts.items():  # what is frozen assigns to the modules within it from outside
         kept.update({f"{path}.{name}": getattr(child, name) for name in assigned if hasattr(child, name)})
