@@ -36,15 +36,7 @@ class EpisodeReturns:
         self._episodes: list[tuple[int, float]] = []
 
     def update(self, batch: TensorDictBase) -> None:
-        """Read a batch.
-
-        Args:
-            batch (TensorDictBase): ``[*B]``, all frames that were made since the last batch.
-
-        Raises:
-            KeyError: an entry is missing.
-            ValueError: a return is not finite.
-        """
+        """Read a batch ``[*B]``, all frames since the last one; returns that are not finite are refused."""
         hint = "TorchRL's RewardSum writes the returns of episodes"
         ended, returns = (read(batch, key, hint).reshape(-1) for key in (self.done_key, self.return_key))
         finished = returns[ended.bool()].double()

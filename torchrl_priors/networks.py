@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -33,14 +34,7 @@ class GaussianMLP(nn.Module):
     Robust Policy Transfer". Its layout follows from the four numbers and names below, which is what an artefact
     (:func:`~torchrl_priors.artifacts.save_prior`) keeps of it beside the parameters.
 
-    Args:
-        obs_dim (int): features of an observation.
-        act_dim (int): dimensions of an action.
-        hidden (sequence of int): cells of each hidden layer. Defaults to ``(64, 64)``.
-        activation (str): one of :data:`ACTIVATIONS`. Defaults to ``"tanh"``.
-
-    Keyword Args:
-        device (torch.device, optional): defaults to torch's.
+    The arguments are those of :func:`make_actor`.
 
     Raises:
         ValueError: a size is not a positive integer, or the activation is unknown.
@@ -117,28 +111,16 @@ def make_actor(
         >>> batch["action"].shape, batch["action_log_prob"].shape
         (torch.Size([8, 6]), torch.Size([8]))
     """
+    net: Any
     if discrete:
-        logits = _mlp(obs_dim, act_dim, tuple(hidden), activation, device)
-        _orthogonal(logits, last_gain=0.01, generator=generator)
-        return ProbabilisticActor(
-            TensorDictModule(logits, in_keys=[in_key], out_keys=["logits"]),
-            in_keys=["logits"],
-            distribution_class=Categorical,
-            return_log_prob=True,
-        )
-    net = GaussianMLP(obs_dim, act_dim, hidden, activation, device=device)
-    _orthogonal(net.mean, last_gain=0.01, generator=generator)
-    return gaussian_actor(net, in_key)
-
-
-def gaussian_actor(net: GaussianMLP, in_key: NestedKey) -> ProbabilisticActor:
-    """The actor around a network, which it does not copy. See :func:`make_actor`."""
-    return ProbabilisticActor(
-        TensorDictModule(net, in_keys=[in_key], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-        return_log_prob=True,
-    )
+        net = dense = _mlp(obs_dim, act_dim, tuple(hidden), activation, device)
+        keys, distribution = ["logits"], Categorical
+    else:
+        net = GaussianMLP(obs_dim, act_dim, hidden, activation, device=device)
+        dense, keys, distribution = net.mean, ["loc", "scale"], IndependentNormal
+    _orthogonal(dense, last_gain=0.01, generator=generator)
+    module = TensorDictModule(net, in_keys=[in_key], out_keys=keys)
+    return ProbabilisticActor(module, in_keys=keys, distribution_class=distribution, return_log_prob=True)
 
 
 def make_critic(
@@ -153,19 +135,7 @@ def make_critic(
 ) -> ValueOperator:
     """A state-value critic: orthogonal weights of gain √2, and 1 in the last layer; biases start at 0.
 
-    Args:
-        obs_dim (int): features of an observation.
-        hidden (sequence of int): cells of each hidden layer. Defaults to ``(64, 64)``.
-        activation (str): one of :data:`ACTIVATIONS`. Defaults to ``"tanh"``.
-        in_key (NestedKey): observations ``[*B, obs_dim]``. Defaults to ``"observation_norm"``.
-
-    Keyword Args:
-        out_key (NestedKey): values ``[*B, 1]``. Defaults to ``"state_value"``.
-        generator (torch.Generator, optional): draws the weights. Defaults to torch's global generator.
-        device (torch.device, optional): defaults to torch's.
-
-    Raises:
-        ValueError: a size is not a positive integer, or the activation is unknown.
+    It writes values ``[*B, 1]`` under ``out_key``. The other arguments and the errors are those of :func:`make_actor`.
 
     Examples:
         >>> import torch
@@ -192,21 +162,11 @@ def make_prior_weight(
 ) -> PriorWeight:
     """The weight of a prior as a network like the critic's, near ``sigmoid(init_bias)`` in every state at first.
 
-    Args:
-        obs_dim (int): features of an observation.
-        hidden (sequence of int): cells of each hidden layer. Defaults to ``(64, 64)``.
-        activation (str): one of :data:`ACTIVATIONS`. Defaults to ``"tanh"``.
-        in_key (NestedKey): observations ``[*B, obs_dim]``. Defaults to ``"observation_norm"``.
+    It writes weights ``[*B, 1]`` under ``out_key``. The other arguments and the errors are those of :func:`make_actor`.
 
     Keyword Args:
         init_bias (float): the bias of the last layer. A negative one starts with less trust. Defaults to 0.
         init_scale (float): multiplies the weights of the last layer. Defaults to 0.01.
-        out_key (NestedKey): weights ``[*B, 1]``. Defaults to ``"prior_weight"``.
-        generator (torch.Generator, optional): draws the weights. Defaults to torch's global generator.
-        device (torch.device, optional): defaults to torch's.
-
-    Raises:
-        ValueError: a size is not a positive integer, or the activation is unknown.
 
     Examples:
         >>> import torch

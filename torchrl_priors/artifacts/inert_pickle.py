@@ -157,16 +157,6 @@ def read_pickle(data: bytes) -> Any:
     """What a pickle holds: numbers, strings, containers, arrays, and a :class:`StandIn` for each other object.
 
     Nothing that it names is run. What is damaged, or names something unknown, is an :class:`InertPickleError`.
-
-    Examples:
-        >>> import pickle
-        >>> read_pickle(pickle.dumps({"mean": np.array([1.0, 2.0])}))
-        {'mean': array([1., 2.])}
-        >>> read_pickle(pickle.dumps(print))
-        Traceback (most recent call last):
-        ...
-        torchrl_priors.artifacts.errors.InertPickleError: it names builtins.print, which is none of the arrays,
-        spaces and statistics that are expected; nothing in it was run
     """
     if len(data) > MAX_BYTES:
         raise InertPickleError(f"it is longer than {MAX_BYTES} bytes")

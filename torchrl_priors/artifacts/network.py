@@ -28,12 +28,7 @@ _MAX_SIZES = 100  # of one layer: a description must not make more layers than i
 
 
 def describe_network(network: nn.Module) -> Parts:
-    """What kind of layers a network has, and their options: numbers as they are, a tensor by its shape.
-
-    Examples:
-        >>> describe_network(nn.Sequential(nn.Linear(3, 4), nn.Tanh()))["layers"]
-        [{'layer': 'linear', 'in_features': 3, 'out_features': 4, 'bias': [4]}, {'layer': 'tanh'}]
-    """
+    """What kind of layers a network has, and their options: numbers as they are, a tensor by its shape."""
     kind = type(network)
     if kind in (nn.Sequential, MLP):
         return {"layer": "sequential", "layers": [describe_network(layer) for layer in network.children()]}

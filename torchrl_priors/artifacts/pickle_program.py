@@ -24,11 +24,7 @@ def check_program(data: bytes | IO[bytes]) -> None:
 
     The danger is in tuples, which are hashed when they are the key of a dictionary, at any depth and each time anew:
     nested by the thousand, or each with the one before it twice. Other objects are held to the number of steps. A file
-    is left where the pickle ends.
-
-    Raises:
-        InertPickleError: its program is too long, or has such tuples, or a memo with holes.
-        ValueError, LookupError: it is damaged.
+    is left where the pickle ends. One that is damaged raises a :class:`ValueError` or :class:`LookupError`.
     """
     stack: list[_Size] = []
     marks: list[int] = []

@@ -13,8 +13,6 @@ from torchrl.modules import MLP
 
 from torchrl_priors.networks import ACTIVATIONS, GaussianMLP
 
-__all__ = ["DenseGaussian", "has_hooks"]
-
 _ONE_THREAD = 2**18  # multiplications of a matrix product up to which OpenBLAS keeps to one thread
 
 
@@ -24,9 +22,7 @@ class DenseGaussian:
     The parameters are used where they are. NumPy's calls take a third of the time of PyTorch's, on such small matrices;
     larger ones, which its matrix product would spread over threads, are refused by :meth:`prepare`.
 
-    Args:
-        layers (list): linear layers, each with the activation that follows it, if one does.
-        scale (AddStateIndependentNormalScale): the last layer.
+    ``layers`` are linear ones, each with the activation that follows it, if one does. ``scale`` is the last layer.
     """
 
     loc: Tensor

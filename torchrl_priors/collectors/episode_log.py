@@ -8,8 +8,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-__all__ = ["EpisodeLog"]
-
 
 class EpisodeLog(gymnasium.Wrapper):
     """Keeps the beginning and the actions of the episode at hand, so that it can be played again.

@@ -81,14 +81,8 @@ class CollectorInterface(ABC):
     ) -> None:
         """Copies weights into the policy; without any there is nothing to do, for the policy is used where it is.
 
-        Args:
-            policy_or_weights (nn.Module, TensorDictBase or mapping, optional): a policy of the same parameters, those
-                as a tensordict, or a ``state_dict``.
-
-        Keyword Args:
-            weights, policy: the same by another name.
-            weights_dict (mapping, optional): the same under ``"policy"``, the only model that there is.
-            worker_ids, model_id: as there is no worker and one model, only ``None`` and ``"policy"`` mean something.
+        Weights are a policy of the same parameters, those as a tensordict, or a ``state_dict``, under any one of the
+        names that TorchRL has for them. There is no worker, and one model, ``"policy"``.
 
         Raises:
             TypeError: weights of another kind, or more than one of them.

@@ -23,8 +23,6 @@ from torchrl.modules import IndependentNormal, SafeModule, SafeProbabilisticModu
 
 from torchrl_priors.collectors.dense_policy import DenseGaussian, has_hooks
 
-__all__ = ["GaussianStep", "ModuleStep", "PolicyStep", "policy_step"]
-
 _CHUNK = 256  # steps whose noise is drawn at once
 
 
@@ -179,16 +177,7 @@ class GaussianStep(PolicyStep):
 
 
 def policy_step(policy: TensorDictModuleBase, action_key: NestedKey, input_keys: Sequence[NestedKey]) -> PolicyStep:
-    """The fastest way to run a policy that gives what calling it gives.
-
-    Args:
-        policy (TensorDictModuleBase): reads some of ``input_keys``, writes ``action_key``.
-        action_key (NestedKey): the key of the action.
-        input_keys (sequence of NestedKey): what there is to read.
-
-    Raises:
-        ValueError: if the policy reads another key, or does not write the action.
-    """
+    """The fastest way to run a policy that reads some of ``input_keys``, and gives what calling it gives."""
     missing = [key for key in policy.in_keys if key not in input_keys]
     if missing:
         hint = "" if len(input_keys) > 1 else " Give a normalizer if the policy reads normalised observations."

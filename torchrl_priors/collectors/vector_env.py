@@ -103,12 +103,6 @@ def spread_seed(seed: int | None, num_envs: int, stream: int) -> tuple[list[int]
     """Independent seeds of the sub-environments and of the actions, from one, or from the operating system.
 
     Gymnasium's own rule, seed + i, gives sub-environment 1 of seed 0 the numbers of sub-environment 0 of seed 1.
-
-    Examples:
-        >>> spread_seed(0, 2, stream=0) == spread_seed(0, 2, stream=0)
-        True
-        >>> spread_seed(0, 2, stream=0) == spread_seed(0, 2, stream=1)
-        False
     """
     words = np.random.SeedSequence(seed, spawn_key=(stream,)).generate_state(num_envs + 1)
     *environments, actions = (int(word) for word in words)

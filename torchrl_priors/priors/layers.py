@@ -13,19 +13,7 @@ class TeacherInput(nn.Module):
     r"""From raw observations to what a teacher's network reads.
 
     Normalises by frozen statistics, :math:`(x-\mu)/\sqrt{\sigma^2+\epsilon}` clipped, in float64 as NumPy does; divides
-    pixels by 255; flattens; each only if asked to.
-
-    Args:
-        shape (sequence of int): of one raw observation.
-
-    Keyword Args:
-        statistics (tuple of Tensor, optional): mean and variance, each of ``shape``. Defaults to ``None``: raw.
-
-    Examples:
-        >>> import torch
-        >>> norm = TeacherInput((2,), statistics=(torch.tensor([1.0, 2.0]), torch.tensor([4.0, 1.0])))
-        >>> norm(torch.tensor([[3.0, 2.0]]))
-        tensor([[1., 0.]])
+    pixels by 255; flattens; each only if asked to. ``shape`` is that of one observation, as that of both statistics.
     """
 
     def __init__(
