@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -75,7 +76,11 @@ def test_a_sweep_that_is_interrupted_and_whose_run_is_killed_gives_what_single_r
 
     def start() -> subprocess.Popen:
         pipe = subprocess.PIPE
-        return subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+        # a job in the background of a shell ignores Ctrl-C, and what it starts does so too
+        heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        return subprocess.Popen(
+            command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True, preexec_fn=heed
+        )
 
     first = start()
     wait_for(lambda: at_work(out, CHECKPOINT), first)
