@@ -26,8 +26,6 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from recipes.common.help import help_text
-
 __all__ = ["SweepSummary", "cores", "fail", "in_sweep", "start"]
 
 
@@ -45,6 +43,8 @@ def start(main: Callable[[], Any], name: str) -> None:
     ``key=~/x`` is in one's home directory, which the shell and Hydra leave to others.
     """
     if {"--help", "-h"} & set(sys.argv[1:]):
+        from recipes.common.help import help_text  # here: it imports torch, which a sweep itself has no use for
+
         print(help_text(name))
         return
     home = re.compile(r"(?<==)~(?=/|$)")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -17,6 +19,7 @@ ROOT = Path(__file__).parents[2]
 RECIPE = """
 import os
 import signal
+import time
 import hydra
 from hydra.core.config_store import ConfigStore
 import recipes.common.sweeps
@@ -29,6 +32,7 @@ ConfigStore.instance().store(
         "raises": -1,
         "fails": -1,
         "dies": -1,
+        "lasts": 0,
         "out": "out",
         "hydra": {
             "run": {"dir": "."},
@@ -49,20 +53,44 @@ def main(cfg):
         os.kill(os.getpid(), signal.SIGKILL)
     with open(f"{cfg.out}/{cfg.seed}", "w") as file:
         file.write(f"{os.getpid()} {os.environ.get('OMP_NUM_THREADS')}")
+    time.sleep(cfg.lasts)
 
 if __name__ == "__main__":
-    main()
+    recipes.common.sweeps.start(main, "nothing")
 """
 
 
-def sweep(folder: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, list[str]]]:
-    """Sweep in a folder; what was said, and the process and the threads of each run that came to its end."""
+def start_sweep(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    """Sweep in a folder."""
     (folder / "nothing.py").write_text(RECIPE.replace("{conf}", str(ROOT / "conf")))
     (folder / "out").mkdir()
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "nothing.py", "-m", *arguments]
-    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    return result, {file.name: file.read_text().split() for file in sorted((folder / "out").iterdir())}
+    pipe = subprocess.PIPE
+    # a job in the background of a shell ignores Ctrl-C, and what it starts does so too
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=pipe,
+        stderr=pipe,
+        text=True,
+        start_new_session=True,
+        preexec_fn=heed,
+    )
+
+
+def done(folder: Path) -> dict[str, list[str]]:
+    """The process and the threads of each run of a sweep that came to its end."""
+    return {file.name: file.read_text().split() for file in sorted((folder / "out").iterdir()) if file.stat().st_size}
+
+
+def sweep(folder: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, list[str]]]:
+    """Sweep in a folder to the end; what was said, and what was done."""
+    process = start_sweep(folder, *arguments)
+    said = process.communicate()
+    return subprocess.CompletedProcess(process.args, process.returncode, *said), done(folder)
 
 
 def at_work(out: Path, progress: str) -> dict[int, Path]:

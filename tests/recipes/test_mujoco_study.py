@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +11,8 @@ import pytest
 
 pytest.importorskip("mujoco")
 from hydra import compose, initialize_config_dir
-from mujoco_cases import ROOT, TINY
-from omegaconf import OmegaConf
+from mujoco_cases import ROOT, TINY, composed
+from sweep_cases import wait_for
 
 from recipes import mujoco_study
 from recipes.mujoco import train
@@ -37,8 +33,7 @@ class Here:
     """A run in this process, in the place of one of its own."""
 
     def __init__(self, run: StudyRun) -> None:
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            cfg = compose("mujoco", overrides=[*run.overrides, f"out={run.folder}"])
+        cfg = composed(*run.overrides, f"out={run.folder}").copy()
         self.returncode = 0
         try:
             train.run(cfg)
@@ -137,25 +132,27 @@ def test_rows_are_in_one_order_whichever_run_ends_first(tmp_path):
     assert pd.read_csv(forth.files[""])[KEY].drop_duplicates()["seed"].tolist() == [0, 1]
 
 
-def test_a_killed_run_stops_no_other_and_is_continued(tmp_path):
-    options = {"set": dict(option.split("=") for option in TINY) | {"total_frames": "2560"}}
-    cfg = config(tmp_path, [ONE | {"seeds": [0, 1]}], **options)
-    (tmp_path / "study.yaml").write_text(OmegaConf.to_yaml(cfg))
-    script = f"from recipes.mujoco_study import *; study(OmegaConf.load({str(tmp_path / 'study.yaml')!r}))"
-    process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    child = None
-    while child is None and process.poll() is None:
-        command = ["pgrep", "-f", f"recipes.mujoco .*seed=0 .*{tmp_path}"]
-        found = subprocess.run(command, capture_output=True, text=True).stdout.split()
-        child = int(found[0]) if found else None
-        time.sleep(0.05)
-    assert child is not None
-    os.kill(child, signal.SIGKILL)
-    error = process.communicate()[1]
-    assert "1 of 2 runs failed" in error
-    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].nunique() == 1
+def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
+    cfg = config(tmp_path, [ONE | {"seeds": [0, 1]}])
+    cfg.set.total_frames = "1280"
+    of_its_own = mujoco_study._start
+
+    def start(run: StudyRun) -> subprocess.Popen | Here:
+        """The first run is a process, which is killed when there is something to go on from."""
+        if run.key[-1] != 0:
+            return Here(run)
+        process = of_its_own(run)
+        wait_for(lambda: [*run.folder.glob("checkpoints/*.sha256.json")], process)
+        process.kill()
+        return process
+
+    with monkeypatch.context() as patch:
+        patch.setattr(mujoco_study, "_start", start)
+        with pytest.raises(ValueError, match="1 of 2 runs failed:\nhopper none none seed 0: "):
+            study(cfg)
+    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [1]
     study(cfg)
-    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].nunique() == 2
+    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
         losses = [name for name in plain if name.startswith("loss_")]
         assert {"loss_objective", "loss_critic", "loss_prior", "loss_prior_weight"} <= set(losses)
         pd.testing.assert_frame_equal(pd.read_csv(whole / "metrics.csv")[losses], plain[losses], rtol=1e-3, atol=1e-5)
-    for stop in (128, 192):
+    for stop in (192,) if compiled else (128, 192):
         out = tmp_path / f"stopped-{stop}"
         interrupt(monkeypatch, out, stop, *options)
         run(out, *options)
@@ -104,19 +104,16 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
 
 
 def test_a_killed_process_continues_where_it_was(tmp_path):
-    def start(out: Path) -> subprocess.Popen:
-        command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
-        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
     run(tmp_path / "whole", "total_frames=1280")
     out, chance = tmp_path / "killed", random.Random(0)
-    process = start(out)
+    command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (out / "checkpoints").exists() and process.poll() is None:
         time.sleep(0.05)
     time.sleep(chance.uniform(0, 0.5))
     process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert start(out).wait() == 0
+    assert process.wait() == -signal.SIGKILL
+    run(out, "total_frames=1280")
     assert (out / "eval.csv").read_bytes() == (tmp_path / "whole" / "eval.csv").read_bytes()
 
 

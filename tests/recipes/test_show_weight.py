@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,14 @@ ROOT = Path(__file__).parents[2]
 SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20"]
 
 
-def config(name: str, *overrides: object) -> DictConfig:
+@lru_cache
+def composed(name: str, *overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose(name, overrides=[str(override) for override in overrides])
+        return compose(name, overrides=list(overrides))
+
+
+def config(name: str, *overrides: object) -> DictConfig:
+    return composed(name, *(str(override) for override in overrides)).copy()
 
 
 def test_weights_are_of_the_very_run_of_the_study():
@@ -116,8 +122,10 @@ def test_another_teacher_is_refused(mujoco_run, tmp_path):
 
 def refused(folder: Path) -> str:
     """Why a run is not shown, in one line."""
+    cfg = config("show_weight", "run=.", "gridworld.points=[1]", "episode.steps=3")
+    cfg.run = str(folder)
     with pytest.raises((ValueError, OSError)) as error:
-        show(config("show_weight", f"run={folder}", "gridworld.points=[1]", "episode.steps=3"))
+        show(cfg)
     message = str(error.value)
     assert "\n" not in message
     return message
@@ -162,17 +170,17 @@ def test_a_damaged_configuration_is_named(content, tmp_path):
 
 
 def test_a_damaged_run_is_named(mujoco_run, tmp_path):
-    folder = tmp_path / "run"
+    folder = Path(shutil.copytree(mujoco_run, tmp_path / "run"))
     (checkpoint,) = (path.name for path in (mujoco_run / "checkpoints").iterdir() if path.is_dir())
 
     def damage(file: str, content: bytes | None) -> str:
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(mujoco_run, folder)
         if content is None:
             (folder / file).unlink()
         else:
             (folder / file).write_bytes(content)
-        return refused(folder)
+        message = refused(folder)
+        (folder / file).write_bytes((mujoco_run / file).read_bytes())
+        return message
 
     whole = (mujoco_run / "config.yaml").read_bytes()
     for content in (None, b"", b"[]", b"{}", b'{"prior": null}', b'{"prior": {}}'):

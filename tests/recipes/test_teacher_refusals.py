@@ -177,6 +177,7 @@ def test_a_damaged_file_is_refused_by_its_name(tmp_path_factory, data):
     file = folder / f"cut.{kind}"
     file.write_bytes(content[:cut])
     options = [] if kind == "zip" else ["prior.outputs=[logits]", TRUSTED]
-    cfg = config(folder, *CARTPOLE, f"prior.path={file}", *options, "method=e2r")
+    cfg = config(folder, *CARTPOLE, "prior.path=cut", *options, "method=e2r")
+    cfg.prior.path = str(file)
     with pytest.raises(ValueError, match=rf"prior\.path=.*cut\.{kind}"):
         open_task(cfg)
