@@ -143,12 +143,12 @@ def test_every_method_trains_in_the_vector_collector(method: str, device: str) -
 
 
 @pytest.fixture(scope="module", params=["discrete", "continuous"])
-def from_two_workers(request: pytest.FixtureRequest) -> tuple[bool, list[TensorDictBase]]:
-    """Starting processes takes seconds, so that the methods share what one pair of them collected."""
+def from_processes(request: pytest.FixtureRequest) -> tuple[bool, list[TensorDictBase]]:
+    """Starting processes takes seconds, so that the methods share what one pair of them, or one, collected."""
     discrete = request.param == "discrete"
     torch.manual_seed(0)
     collector = MultiSyncCollector(
-        [make_discrete_env if discrete else make_continuous_env] * 2,
+        [make_discrete_env] * 2 if discrete else [make_continuous_env],
         make_actor(discrete),
         frames_per_batch=FRAMES,
         total_frames=2 * FRAMES,
@@ -160,6 +160,6 @@ def from_two_workers(request: pytest.FixtureRequest) -> tuple[bool, list[TensorD
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_in_a_collector_of_processes(method: str, from_two_workers: tuple[bool, list[TensorDictBase]]) -> None:
-    discrete, batches = from_two_workers
+def test_in_a_collector_of_processes(method: str, from_processes: tuple[bool, list[TensorDictBase]]) -> None:
+    discrete, batches = from_processes
     train(method, discrete, "cpu", lambda actor, postproc: [postproc(batch.clone()) for batch in batches])

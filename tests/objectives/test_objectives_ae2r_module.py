@@ -228,7 +228,7 @@ def test_compiled_forward_gives_the_same_numbers(kind, method):
     data = make_batch(kind)
     expected = loss(data)
     torch._dynamo.reset()
-    losses = torch.compile(loss, backend="aot_eager")(data)
+    losses = torch.compile(loss, backend="aot_eager", fullgraph=True)(data)
     assert losses.keys() == expected.keys()
     for key in loss_names(expected):
         torch.testing.assert_close(losses[key], expected[key])

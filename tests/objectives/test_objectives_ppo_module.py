@@ -97,7 +97,7 @@ def test_compiled_forward_gives_the_same_numbers(kind):
     loss, data = make_ppo_loss(kind=kind), make_batch(kind)
     expected = loss(data)
     torch._dynamo.reset()
-    losses = torch.compile(loss, backend="aot_eager")(data)
+    losses = torch.compile(loss, backend="aot_eager", fullgraph=True)(data)
     for key in loss_names(expected):
         torch.testing.assert_close(losses[key], expected[key])
     total(losses).backward()

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from collections import defaultdict
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from hydra import compose, initialize_config_dir
 from mujoco_cases import run
+
+from recipes.gridworld import study
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/guides/files.md").read_text(encoding="utf-8")
@@ -61,9 +62,14 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], s
     run(folder / "trial", "method=trial", teacher, "trial.max_frames=64", "trial.min_frames=64")
     with pytest.raises(SystemExit):
         run(folder / "failed", "method=none", "ppo.lr=1e30")
-    command = [sys.executable, "-m", "recipes.gridworld", "study=small", *SMALL.split(), "bootstrap.reps=20"]
-    command.append(f"out={folder / 'gridworld'}")
-    subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        options = ["study=small", *SMALL.split(), "bootstrap.reps=20", f"out={folder / 'gridworld'}"]
+        cfg = compose("gridworld", overrides=options)
+    gridworld = study.open_folder(cfg)
+    with pytest.MonkeyPatch.context() as patch:  # of figures there are no columns
+        patch.setattr("recipes.plots.style._pictures", lambda figure, formats, dpi: [b"not drawn"] * len(formats))
+        study.report(cfg, gridworld, study.run_study(cfg, gridworld))
+    gridworld.release()
 
     found: dict[tuple[str, str], set[str]] = defaultdict(set)
     tables = [columns(RUN, folder / name) for name in ("none", "ae2r", "trial")]
