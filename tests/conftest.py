@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -24,6 +25,13 @@ torch.set_num_threads(1)
 # A property that fails must fail for everyone who runs the tests; times are never asserted.
 settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=50, print_blob=True)
 settings.load_profile("deterministic")
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: Python's collector of garbage looks rarely, and not at that million objects."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(100_000, 10, 100)
 
 
 @pytest.fixture(autouse=True)

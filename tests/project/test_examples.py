@@ -13,6 +13,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PARTS = {"catch.py"}  # imported by another
 SCRIPTS = sorted(path.name for path in EXAMPLES.glob("*.py") if path.name not in PARTS)
+ONE_WORKER = {"ray_collector.py": ["--workers=1"]}  # a process is seconds of imports
 FRAMES = {"a2c.py": 10_240, "ppo.py": 3200, "pixels.py": 1536, "trial.py": 10_240, "from_yaml.py": 2048}
 
 
@@ -30,7 +31,7 @@ def test_example_runs_and_prints_returns(name: str, monkeypatch: pytest.MonkeyPa
         pytest.importorskip("ray")
     monkeypatch.chdir(tmp_path)
     option = "frames=" if name == "from_yaml.py" else "--frames="
-    run(name, monkeypatch, f"{option}{FRAMES.get(name, 2048)}")
+    run(name, monkeypatch, f"{option}{FRAMES.get(name, 2048)}", *ONE_WORKER.get(name, []))
     lines = [line for line in capsys.readouterr().out.splitlines() if " frames, " in line]
     assert lines
     assert all(math.isfinite(float(re.search(r"(?:return|caught) +(-?[\d.]+|nan)", line)[1])) for line in lines)
