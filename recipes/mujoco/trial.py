@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from statistics import NormalDist
 from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
@@ -11,11 +12,14 @@ from torch import Tensor
 from recipes.mujoco.agent import Student
 from recipes.mujoco.config import ALONE, MujocoConfig, sources
 from recipes.mujoco.task import Task
+from torchrl_priors.episode_returns import welch
 from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 
 __all__ = ["LET_GO", "Students", "arms"]
 
 LET_GO = ", let go"
+FALL = 3.0
+"""Standard errors by which a student without its teacher is behind before the one who is kept goes on."""
 
 
 def arms(cfg: MujocoConfig) -> dict[str, MujocoConfig]:
@@ -39,7 +43,8 @@ class Students:
     With ``method=trial`` the first trial is between the teachers. When the returns of a student with a teacher do not
     rise any more, a second one finds out whether it is better off without: a twin, whose teacher fades, against the
     student itself. If the teacher stays, the next such trial comes when the student has made twice as many frames, and
-    may take twice as long: gains without a teacher are slow to show, and to let go of one can't be undone.
+    may take twice as long: gains without a teacher are slow to show. The student with the teacher is kept where it
+    was. It goes on in the place of one that let go and fell clearly behind the returns that it had then.
     """
 
     def __init__(self, cfg: MujocoConfig, task: Task) -> None:
@@ -48,18 +53,17 @@ class Students:
         self.chosen = next(iter(self.by_arm))
         """Whose policy is the run's: the last winner's; before there is one, that of the student alone."""
         self.results: list[TrialResult] = []
+        self._patience, self._tried = 0, 0
         self.trial = self._trial(list(self.by_arm)) if len(self.by_arm) > 1 else None
         self.frames = 0
         """Of all students together."""
-        self._patience = 0
 
     def _trial(self, arms: list[str]) -> TeacherTrial:
         """In doubt about teachers the student alone goes on; about letting go, who has the higher returns."""
         trial = self.cfg.trial
         options: dict[str, Any] = {"alpha": trial.alpha, "recent": trial.recent, "min_frames": trial.min_frames}
-        before = sum(arm.endswith(LET_GO) for result in self.results for arm in result.frames)
         options["in_doubt"] = "first" if arms[0] == ALONE else "best"
-        return TeacherTrial(arms, max_frames=trial.max_frames * 2**before, **options)
+        return TeacherTrial(arms, max_frames=trial.max_frames * 2 ** max(self._tried - 1, 0), **options)
 
     def round(self) -> Iterator[tuple[str, dict[str, Tensor], Tensor | None]]:
         """Train each student that is still in on one rollout; its name, what was measured, and the prior weights.
@@ -78,13 +82,33 @@ class Students:
             if (result := self.trial.decide()) is not None:
                 self.results.append(result)
                 self.chosen, self.trial = result.winner, None
+        elif (result := self._fallen()) is not None:
+            self.results.append(result)
+            del self.by_arm[self.chosen]
+            self.chosen = result.winner
         elif self._may_let_go():
             student = self.by_arm[self.chosen]
             twin = student.twin()
             twin.leaving = student.collector.frames
-            self._patience = 2 * student.collector.frames
+            self._patience, self._tried = 2 * student.collector.frames, self._tried + 1
             self.by_arm[self.chosen + LET_GO] = twin
             self.trial = self._trial([self.chosen, self.chosen + LET_GO])
+
+    def _fallen(self) -> TrialResult | None:
+        """That a student without its teacher is clearly behind the one who is kept, if it is so."""
+        student, kept = self.by_arm[self.chosen], self.by_arm.get(self.chosen.removesuffix(LET_GO))
+        if kept is None or kept is student or student.plateau is None or kept.plateau is None:
+            return None
+        before, now = (plateau.within(plateau.window) for plateau in (kept.plateau, student.plateau))
+        if min(len(before), len(now)) < kept.plateau.min_episodes:
+            return None
+        fall, error = welch(before, now)
+        if fall <= max(FALL * error, kept.plateau.gain * abs(float(before.mean()))):
+            return None
+        arms = {self.chosen.removesuffix(LET_GO): kept, self.chosen: student}
+        frames = {arm: each.collector.frames for arm, each in arms.items()}
+        returns = dict(zip(arms, (float(before.mean()), float(now.mean())), strict=True))
+        return TrialResult(next(iter(arms)), fall, NormalDist().cdf(FALL), frames, returns)
 
     def _may_let_go(self) -> bool:
         """Whether the student's returns stand still, it is time to look, and a trial can still be decided."""
@@ -113,6 +137,7 @@ class Students:
             "chosen": self.chosen,
             "frames": self.frames,
             "patience": self._patience,
+            "tried": self._tried,
             "leaving": {arm: student.leaving for arm, student in self.by_arm.items()},
             "results": [result._asdict() for result in self.results],
             "trial": None if self.trial is None else self.trial.state_dict(),
@@ -127,7 +152,7 @@ class Students:
                 kept = self.by_arm[arm.removesuffix(LET_GO)]
                 self.by_arm[arm] = Student(kept.cfg, kept.task)
             self.by_arm[arm].leaving = leaving
-        self._patience = int(state_dict["patience"])
+        self._patience, self._tried = int(state_dict["patience"]), int(state_dict["tried"])
         self.trial = None
         if (trial := state_dict["trial"]) is not None:
             self.trial = self._trial([arm for arm in self.by_arm if arm in trial["returns"]])

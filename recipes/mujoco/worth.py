@@ -77,7 +77,7 @@ def _plus_minus(row: dict[str, Any]) -> str:
 
 def _decision(cfg: MujocoConfig, results: Sequence[TrialResult]) -> str:
     """What the trials made of the teachers, in words."""
-    said = []
+    said, last = [], ""
     for result in results:
         sure = f"confidence {min(result.confidence, 0.999):.1%}" if result.confidence else "in doubt"
         if result.winner == ALONE:
@@ -85,9 +85,10 @@ def _decision(cfg: MujocoConfig, results: Sequence[TrialResult]) -> str:
         elif result.winner.endswith(LET_GO):
             said.append(f"{result.winner.removesuffix(LET_GO)} was let go ({sure})")
         elif any(arm.endswith(LET_GO) for arm in result.frames):
-            said.append(f"{result.winner} stayed ({sure})")
+            said.append(f"{result.winner} {'came back' if last.endswith(LET_GO) else 'stayed'} ({sure})")
         else:
             said.append(f"the student went on with {result.winner} ({sure})")
+        last = result.winner
     if said:
         return "; ".join(said) + "."
     return f"none was asked for: method={cfg.method} follows its teacher. method=trial finds out whether it helps."

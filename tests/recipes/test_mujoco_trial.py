@@ -8,10 +8,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
+from safetensors.torch import load_file
 
 pytest.importorskip("mujoco")
 from mujoco_cases import interrupt, run
 
+from recipes.mujoco.trial import FALL
 from recipes.report.runs import find, name_priors, read, without_misfits
 from recipes.show_weight.episode import load_agent
 from torchrl_priors import Plateau, TeacherTrial
@@ -118,6 +121,37 @@ def test_a_teacher_that_stays_is_tried_again_after_twice_the_frames_for_twice_as
     assert rows["arm"].tolist() == [*[kept] * 2, *[kept, twin] * 2, kept, *[kept, twin] * 4, kept]
     results = json.loads((out / "trials.json").read_text())
     assert [(result["winner"], result["confidence"]) for result in results] == [(kept, 0), (kept, 0)]
+
+
+def test_a_student_who_let_go_and_fell_behind_gives_way_to_the_one_who_is_kept(standing_still, tmp_path, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 256))
+    kept, twin = "kickstart", "kickstart, let go"
+    options = [*standing_still, "ppo.lr=1e-3", "total_frames=768"]
+    with monkeypatch.context() as patch:
+        always(patch, twin)
+        patch.setattr("recipes.mujoco.trial.welch", lambda before, now: (FALL * 1e9, 1e9 - 1))
+        whole = run(tmp_path / "whole", *options)
+        interrupt(patch, tmp_path / "stopped", 640, *options)
+        run(tmp_path / "stopped", *options)
+    assert pd.read_csv(whole / "metrics.csv")["arm"].tolist() == [*[kept] * 4, *[kept, twin] * 2, twin, *[kept] * 3]
+    let_go, fell = json.loads((whole / "trials.json").read_text())
+    assert (let_go["winner"], fell["winner"]) == (twin, kept)
+    assert fell["frames"] == {kept: 384, twin: 448}
+    assert fell["confidence"] == pytest.approx(0.99865, abs=1e-5)  # of three standard errors
+    for name in ("eval.csv", "policy.safetensors", "trials.json"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
+    monkeypatch.setattr(Plateau, "reached", False)
+    never = run(tmp_path / "never", *options, "total_frames=576")
+    torch.testing.assert_close(*(load_file(out / "policy.safetensors") for out in (whole, never)), rtol=0, atol=0)
+
+
+def test_a_little_less_is_no_fall(standing_still, tmp_path, monkeypatch):
+    monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 256))
+    always(monkeypatch, "kickstart, let go")
+    for fall in ((2.9, 1.0), (0.0, 0.0)):
+        monkeypatch.setattr("recipes.mujoco.trial.welch", lambda before, now, fall=fall: fall)
+        out = run(tmp_path / str(fall[0]), *standing_still, "total_frames=640")
+        assert winner(out) == "kickstart, let go"
 
 
 @pytest.mark.parametrize("stop", [256, 384, 576])  # before, in and after the trial with the twin
