@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from importlib import import_module
 from importlib.machinery import PathFinder
@@ -87,8 +88,8 @@ def read_teacher(cfg: MujocoConfig, source: Source, env_id: str, obs_dim: int, a
             f"prior.trust_code=False: expected true, as prior.path={source} is a program, which may do anything that"
             " you may do. Set it for code of your own, or of someone whom you trust."
         )
-    if not _content(source).is_file():
-        there = "a folder, expected a file" if source.path.is_dir() else "no such file"
+    if not os.path.isfile(_content(source)):  # Path.is_file raises for a name that is too long
+        there = "a folder, expected a file" if os.path.isdir(source.path) else "no such file"
         raise FileNotFoundError(f"prior.path={source}: {there}.")
     readers: dict[str, Callable[[], Prior]] = {
         "file": lambda: load_prior(source.path, env_id=env_id),
@@ -134,7 +135,7 @@ def _read_sb3(cfg: MujocoConfig, source: Source, actions: TensorSpec) -> Prior:
     vecnormalize = cfg.prior.vecnormalize
     if vecnormalize is not None:
         vecnormalize = str(at_home("prior.vecnormalize", vecnormalize))
-        if not Path(vecnormalize).is_file():
+        if not os.path.isfile(vecnormalize):
             raise FileNotFoundError(f"prior.vecnormalize={vecnormalize}: no such file.")
     options: dict[str, Any] = {"vecnormalize": vecnormalize, "temperature": cfg.prior.temperature}
     try:

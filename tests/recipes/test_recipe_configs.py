@@ -65,6 +65,7 @@ def refusal(name: str, key: str, value: Any) -> str | None:
 @example(("gridworld", "priors"), ["random_" + "9" * 5000])
 @example(("mujoco", "ppo.hidden"), [])
 @example(("mujoco", "method"), "")
+@example(("mujoco", "prior.path"), "a" * 300)
 def test_a_value_is_fine_or_refused_by_its_key(where: tuple[str, str], value: Any) -> None:
     name, key = where
     message = refusal(name, key, value)
