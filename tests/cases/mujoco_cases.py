@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from omegaconf import DictConfig
 
 from recipes.mujoco import train
@@ -27,15 +26,8 @@ TINY = [
 ]
 
 
-@lru_cache
-def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("mujoco", overrides=list(overrides))
-
-
 def config(out: Path, *overrides: str) -> DictConfig:
-    """What Hydra makes of a command line, once for each: it takes a tenth of a second, a tiny run not much more."""
-    cfg = composed(*TINY, *overrides).copy()
+    cfg = composed("mujoco", *TINY, *overrides)
     cfg.out = str(out)
     return cfg
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from hydra import compose, initialize_config_dir
+from composed import composed
 from mujoco_cases import run
 
 from recipes.gridworld import study
@@ -62,9 +62,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], s
     run(folder / "trial", "method=trial", teacher, "trial.max_frames=64", "trial.min_frames=64")
     with pytest.raises(SystemExit):
         run(folder / "failed", "method=none", "ppo.lr=1e30")
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        options = ["study=small", *SMALL.split(), "bootstrap.reps=20", f"out={folder / 'gridworld'}"]
-        cfg = compose("gridworld", overrides=options)
+    cfg = composed("gridworld", "study=small", *SMALL.split(), "bootstrap.reps=20", f"out={folder / 'gridworld'}")
     gridworld = study.open_folder(cfg)
     with pytest.MonkeyPatch.context() as patch:  # of figures there are no columns
         patch.setattr("recipes.plots.style._pictures", lambda figure, formats, dpi: [b"not drawn"] * len(formats))

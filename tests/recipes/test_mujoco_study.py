@@ -10,8 +10,9 @@ import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
+from composed import composed
 from hydra import compose, initialize_config_dir
-from mujoco_cases import ROOT, TINY, composed
+from mujoco_cases import ROOT, TINY
 from sweep_cases import wait_for
 
 from recipes import mujoco_study
@@ -20,8 +21,7 @@ from recipes.mujoco_study import KEY, StudyRun, Tables, expand, study
 
 
 def config(tmp_path: Path, runs: list, **changes: Any) -> Any:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = compose("mujoco_study", overrides=["study_mujoco=trial"])
+    cfg = composed("mujoco_study", "study_mujoco=trial")
     cfg.set = dict(option.split("=") for option in TINY)
     cfg.out, cfg.work, cfg.name, cfg.runs = str(tmp_path / "tables"), str(tmp_path / "work"), "tiny", runs
     for name, value in changes.items():
@@ -33,7 +33,7 @@ class Here:
     """A run in this process, in the place of one of its own."""
 
     def __init__(self, run: StudyRun) -> None:
-        cfg = composed(*run.overrides, f"out={run.folder}").copy()
+        cfg = composed("mujoco", *run.overrides, f"out={run.folder}")
         self.returncode = 0
         try:
             train.run(cfg)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import random
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import torch
 from mujoco_cases import ROOT, TINY, config, interrupt, run
+from sweep_cases import wait_for
 from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import TanhNormal
@@ -105,12 +104,10 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
 
 def test_a_killed_process_continues_where_it_was(tmp_path):
     run(tmp_path / "whole", "total_frames=1280")
-    out, chance = tmp_path / "killed", random.Random(0)
+    out = tmp_path / "killed"
     command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (out / "checkpoints").exists() and process.poll() is None:
-        time.sleep(0.05)
-    time.sleep(chance.uniform(0, 0.5))
+    wait_for(lambda: [*out.glob("checkpoints/*.sha256.json")], process)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
     run(out, "total_frames=1280")

@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 import shutil
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from composed import composed as config
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 from recipes.gridworld.study import TaughtWorld, make_learner, run_world
 from recipes.show_weight.show import mean_over, show
 from torchrl_priors import load_prior
 
-ROOT = Path(__file__).parents[2]
 SMALL = ["worlds=2", "teacher.steps=100", "evaluation.points=3", "evaluation.interval=20"]
-
-
-@lru_cache
-def composed(name: str, *overrides: str) -> DictConfig:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose(name, overrides=list(overrides))
-
-
-def config(name: str, *overrides: object) -> DictConfig:
-    return composed(name, *(str(override) for override in overrides)).copy()
 
 
 def test_weights_are_of_the_very_run_of_the_study():
