@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from recipes.mujoco import train
 from recipes.mujoco.run import Run
+from torchrl_priors.objectives import compiled_step
 
 ROOT = Path(__file__).parents[2]
 TINY = [
@@ -21,7 +22,7 @@ TINY = [
     "ppo.hidden=[8]",
     "evaluation.interval=64",
     "evaluation.episodes=2",
-    "checkpoint.interval=64",
+    "checkpoint.interval=128",
     "compile=false",
 ]
 
@@ -32,8 +33,17 @@ def config(out: Path, *overrides: str) -> DictConfig:
     return cfg
 
 
-def run(out: Path, *overrides: str) -> Path:
-    train.run(config(out, *overrides))
+def run(out: Path, *overrides: str, recorded: bool = False) -> Path:
+    """A run to its end. Where nothing is compiled and no record is asked for, its steps are taken without one.
+
+    To record a step takes longer than the few that a tiny run has. That a record does what the step does is tested
+    where records are.
+    """
+    cfg = config(out, *overrides)
+    with pytest.MonkeyPatch.context() as patch:
+        if not (recorded or cfg.compile):
+            patch.setattr(compiled_step, "record", lambda step, inputs, backend: lambda inputs: step(*inputs))
+        train.run(cfg)
     return out
 
 

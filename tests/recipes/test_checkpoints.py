@@ -9,10 +9,21 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("mujoco")
-from mujoco_cases import interrupt, run
+import mujoco_cases
 
 from recipes.common import checkpoints as module
 from recipes.common.checkpoints import Checkpoints
+
+
+OFTEN = "checkpoint.interval=64"
+
+
+def run(out: Path, *overrides: str) -> None:
+    mujoco_cases.run(out, OFTEN, *overrides)
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *overrides: str) -> None:
+    mujoco_cases.interrupt(monkeypatch, out, frames, OFTEN, *overrides)
 
 
 @pytest.fixture(scope="module")

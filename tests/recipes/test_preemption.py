@@ -39,7 +39,7 @@ def test_a_job_that_is_taken_away_is_saved_queued_again_and_gives_the_same_resul
     said = "".join(file.read_text() for file in (tmp_path / "said").rglob("*_log.*"))
     for words in ("asked to stop, saved at", "Requeued job"):
         assert words in said
-    assert results(out / "0") == results(run(tmp_path / "alone", *long))
+    assert results(out / "0") == results(run(tmp_path / "alone", *long, recorded=True))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR2])

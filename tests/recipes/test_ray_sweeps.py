@@ -92,5 +92,5 @@ def test_a_sweep_with_a_run_that_is_killed_gives_what_single_runs_give(tmp_path:
     assert process.returncode == 0, errors
     assert "Sweep: 8 of 8 runs are done, 0 failed." in output
     for seed in range(8):
-        alone = run(tmp_path / f"alone-{seed}", f"seed={seed}")
+        alone = run(tmp_path / f"alone-{seed}", f"seed={seed}", recorded=True)
         assert results(out / str(seed)) == results(alone)

@@ -103,14 +103,14 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
 
 
 def test_a_killed_process_continues_where_it_was(tmp_path):
-    run(tmp_path / "whole", "total_frames=1280")
+    run(tmp_path / "whole", "total_frames=1280", recorded=True)
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_for(lambda: [*out.glob("checkpoints/*.sha256.json")], process)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    run(out, "total_frames=1280")
+    run(out, "total_frames=1280", recorded=True)
     assert (out / "eval.csv").read_bytes() == (tmp_path / "whole" / "eval.csv").read_bytes()
 
 
@@ -156,8 +156,8 @@ def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
 def test_resume_false_starts_anew_and_forgets_the_old_checkpoints(tmp_path, monkeypatch, capsys):
     run(tmp_path)
     whole = (tmp_path / "eval.csv").read_bytes()
-    interrupt(monkeypatch, tmp_path, 128, "resume=false")
-    assert [path.name[-3:] for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()] == ["064"]
+    interrupt(monkeypatch, tmp_path, 192, "resume=false")
+    assert [path.name[-3:] for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()] == ["128"]
     run(tmp_path)
     assert (tmp_path / "eval.csv").read_bytes() == whole
     run(tmp_path, "resume=false")
