@@ -1,7 +1,8 @@
-"""What Hydra makes of a command line."""
+"""What Hydra makes of a command line, and what a process is started with."""
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,3 +21,8 @@ def _composed(name: str, *overrides: str) -> DictConfig:
 def composed(name: str, *overrides: object) -> DictConfig:
     """The configuration of a recipe, composed once for each command line: that takes longer than a tiny run does."""
     return _composed(name, *map(str, overrides)).copy()
+
+
+def with_another_hash_seed() -> dict[str, str]:
+    """The environment of a process that orders sets differently than this one."""
+    return {**os.environ, "PYTHONHASHSEED": "2" if os.environ.get("PYTHONHASHSEED") == "1" else "1"}

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 from composed import composed
 from omegaconf import DictConfig
+from torch import Tensor
 
 from recipes.mujoco import train
 from recipes.mujoco.run import Run
@@ -33,17 +37,26 @@ def config(out: Path, *overrides: str) -> DictConfig:
     return cfg
 
 
-def run(out: Path, *overrides: str, recorded: bool = False) -> Path:
-    """A run to its end. Where nothing is compiled and no record is asked for, its steps are taken without one.
+@contextmanager
+def without_records() -> Iterator[None]:
+    """Steps that are not compiled are not recorded either: that takes longer than the few of a tiny run.
 
-    To record a step takes longer than the few that a tiny run has. That a record does what the step does is tested
-    where records are.
+    That a record does what the step does is tested where records are.
     """
-    cfg = config(out, *overrides)
+    record = compiled_step.record
+
+    def take(step: Any, inputs: list[Tensor], backend: str) -> Any:
+        return (lambda inputs: step(*inputs)) if backend == "eager" else record(step, inputs, backend)
+
     with pytest.MonkeyPatch.context() as patch:
-        if not (recorded or cfg.compile):
-            patch.setattr(compiled_step, "record", lambda step, inputs, backend: lambda inputs: step(*inputs))
-        train.run(cfg)
+        patch.setattr(compiled_step, "record", take)
+        yield
+
+
+def run(out: Path, *overrides: str, recorded: bool = False) -> Path:
+    """A run to its end; ``recorded`` to the bit as in a process of its own."""
+    with nullcontext() if recorded else without_records():
+        train.run(config(out, *overrides))
     return out
 
 

@@ -92,9 +92,8 @@ def test_reset_leaves_the_prior_alone(functional):
             assert torch.equal(value, before[name][key]) == (name == "prior")
 
 
-@pytest.mark.parametrize("kind", ["categorical", "normal"])
-def test_compiled_forward_gives_the_same_numbers(kind):
-    loss, data = make_ppo_loss(kind=kind), make_batch(kind)
+def test_compiled_forward_gives_the_same_numbers():
+    loss, data = make_ppo_loss(kind="normal"), make_batch("normal")
     expected = loss(data)
     torch._dynamo.reset()
     losses = torch.compile(loss, backend="aot_eager", fullgraph=True)(data)

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from mujoco_cases import without_records
 from test_readme import a_readers_own_objects
 from torchrl.objectives.value import GAE
 
@@ -54,7 +55,8 @@ def run(command: str, folder: Path) -> int | str | None:
         try:
             package = importlib.import_module(words[2])
             command_of = importlib.import_module(f"{words[2]}.__main__") if hasattr(package, "__path__") else package
-            command_of.main()
+            with without_records():
+                command_of.main()
         except SystemExit as end:
             return end.code
     return None

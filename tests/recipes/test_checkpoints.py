@@ -14,7 +14,6 @@ import mujoco_cases
 from recipes.common import checkpoints as module
 from recipes.common.checkpoints import Checkpoints
 
-
 OFTEN = "checkpoint.interval=64"
 
 

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("mujoco")
 from composed import composed
 from hydra import compose, initialize_config_dir
-from mujoco_cases import ROOT, TINY
+from mujoco_cases import ROOT, TINY, without_records
 from sweep_cases import wait_for
 
 from recipes import mujoco_study
@@ -36,7 +36,8 @@ class Here:
         cfg = composed("mujoco", *run.overrides, f"out={run.folder}")
         self.returncode = 0
         try:
-            train.run(cfg)
+            with without_records():
+                train.run(cfg)
         except SystemExit as error:
             run.folder.mkdir(parents=True)
             (run.folder / "log.txt").write_text(str(error))

@@ -79,14 +79,15 @@ def test_the_winner_goes_on_as_the_run_of_its_method_does(arm, trial, teachers, 
     )
 
 
-@pytest.mark.parametrize("stop", [128, 192, 320])  # within a round; between rounds; after the decision
-def test_a_trial_that_was_interrupted_gives_the_same_files(stop, trial, tmp_path, monkeypatch):
+def test_a_trial_that_was_interrupted_gives_the_same_files(trial, tmp_path, monkeypatch):
     options = [*trial, "total_frames=512", "prior.degrade=random"]
     whole = run(tmp_path / "whole", *options)
-    interrupt(monkeypatch, tmp_path / "stopped", stop, *options)
-    run(tmp_path / "stopped", *options)
-    for name in ("eval.csv", "policy.safetensors", "trials.json"):
-        assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
+    for stop in (128, 192, 320):  # within a round; between rounds; after the decision
+        out = tmp_path / f"stopped-{stop}"
+        interrupt(monkeypatch, out, stop, *options)
+        run(out, *options)
+        for name in ("eval.csv", "policy.safetensors", "trials.json"):
+            assert (out / name).read_bytes() == (whole / name).read_bytes(), stop
 
 
 @pytest.fixture
@@ -131,7 +132,7 @@ def test_a_student_who_let_go_and_fell_behind_gives_way_to_the_one_who_is_kept(s
         always(patch, twin)
         patch.setattr("recipes.mujoco.trial.welch", lambda before, now: (FALL * 1e9, 1e9 - 1))
         whole = run(tmp_path / "whole", *options)
-        interrupt(patch, tmp_path / "stopped", 640, *options)
+        interrupt(patch, tmp_path / "stopped", 704, *options)  # it goes on from 640, after the fall
         run(tmp_path / "stopped", *options)
     assert pd.read_csv(whole / "metrics.csv")["arm"].tolist() == [*[kept] * 4, *[kept, twin] * 2, twin, *[kept] * 3]
     let_go, fell = json.loads((whole / "trials.json").read_text())
@@ -154,15 +155,16 @@ def test_a_little_less_is_no_fall(standing_still, tmp_path, monkeypatch):
         assert winner(out) == "kickstart, let go"
 
 
-@pytest.mark.parametrize("stop", [256, 384, 576])  # before, in and after the trial with the twin
-def test_an_interrupted_run_with_a_twin_gives_the_same_files(stop, standing_still, tmp_path, monkeypatch):
+def test_an_interrupted_run_with_a_twin_gives_the_same_files(standing_still, tmp_path, monkeypatch):
     monkeypatch.setattr(Plateau, "reached", property(lambda self: self.frames >= 256))
     options = [*standing_still, "ppo.lr=1e-3", "total_frames=640"]
     whole = run(tmp_path / "whole", *options)
-    interrupt(monkeypatch, tmp_path / "stopped", stop, *options)
-    run(tmp_path / "stopped", *options)
-    for name in ("eval.csv", "policy.safetensors", "trials.json"):
-        assert (tmp_path / "stopped" / name).read_bytes() == (whole / name).read_bytes()
+    for stop in (256, 384, 576):  # before, in and after the trial with the twin
+        out = tmp_path / f"stopped-{stop}"
+        interrupt(monkeypatch, out, stop, *options)
+        run(out, *options)
+        for name in ("eval.csv", "policy.safetensors", "trials.json"):
+            assert (out / name).read_bytes() == (whole / name).read_bytes(), stop
 
 
 def test_no_trial_begins_that_could_not_be_decided(standing_still, tmp_path, monkeypatch):

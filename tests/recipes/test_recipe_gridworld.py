@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from composed import with_another_hash_seed
 from omegaconf import OmegaConf
 
 from recipes.gridworld.__main__ import main
@@ -301,6 +302,7 @@ def test_killed_run_continues_to_the_same_tables(tmp_path):
     with subprocess.Popen(
         command(*LONG, "block_worlds=1", "workers=2", f"out={out}"),
         cwd=ROOT,
+        env=with_another_hash_seed(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     ) as run:

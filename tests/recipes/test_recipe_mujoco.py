@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
+from composed import with_another_hash_seed
 from mujoco_cases import ROOT, TINY, config, interrupt, run
 from sweep_cases import wait_for
 from tensordict import TensorDict
@@ -106,7 +107,9 @@ def test_a_killed_process_continues_where_it_was(tmp_path):
     run(tmp_path / "whole", "total_frames=1280", recorded=True)
     out = tmp_path / "killed"
     command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command, cwd=ROOT, env=with_another_hash_seed(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     wait_for(lambda: [*out.glob("checkpoints/*.sha256.json")], process)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
