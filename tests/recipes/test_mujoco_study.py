@@ -151,8 +151,9 @@ def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
         patch.setattr(mujoco_study, "_start", start)
         with pytest.raises(ValueError, match="1 of 2 runs failed:\nhopper none none seed 0: "):
             study(cfg)
-    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [1]
-    study(cfg)
+        assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [1]
+        patch.setattr(mujoco_study, "_start", Here)
+        study(cfg)
     assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0, 1]
 
 

@@ -21,7 +21,7 @@ from recipes.common.preemption import Notice
 
 @pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="it asks Linux for the process of a run")
 def test_a_job_that_is_taken_away_is_saved_queued_again_and_gives_the_same_result(tmp_path: Path) -> None:
-    out, long = tmp_path / "sweep", ["total_frames=1280", "checkpoint.interval=100000"]
+    out, long = tmp_path / "sweep", ["total_frames=640", "checkpoint.interval=100000"]
     command = [sys.executable, "-m", "recipes.mujoco", "-m", "hydra/launcher=submitit_local", *TINY, *long]
     command += [f"out={out}/${{seed}}", f"hydra.sweep.dir={tmp_path}/said"]
     sweep = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

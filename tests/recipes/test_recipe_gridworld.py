@@ -165,7 +165,7 @@ def test_every_study_runs_and_the_shaped_reading_too(study, tmp_path):
 FIVE = ["worlds=5", "priors=[expert,structural_3]", "methods=[none,ae2r,aligned]", "world.end_prob=0.05"]
 FIVE += ["evaluation.interval=100"]
 # Long enough to be killed in the middle.
-LONG = ["worlds=12", "priors=[expert]", "methods=[none,ae2r]", "evaluation.interval=200000"]
+LONG = ["worlds=8", "priors=[expert]", "methods=[none,ae2r]", "evaluation.interval=200000"]
 
 
 @pytest.fixture(scope="module")

@@ -104,16 +104,16 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
 
 
 def test_a_killed_process_continues_where_it_was(tmp_path):
-    run(tmp_path / "whole", "total_frames=1280", recorded=True)
+    run(tmp_path / "whole", "total_frames=640", recorded=True)
     out = tmp_path / "killed"
-    command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=1280", f"out={out}"]
+    command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=640", f"out={out}"]
     process = subprocess.Popen(
         command, cwd=ROOT, env=with_another_hash_seed(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     wait_for(lambda: [*out.glob("checkpoints/*.sha256.json")], process)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    run(out, "total_frames=1280", recorded=True)
+    run(out, "total_frames=640", recorded=True)
     assert (out / "eval.csv").read_bytes() == (tmp_path / "whole" / "eval.csv").read_bytes()
 
 

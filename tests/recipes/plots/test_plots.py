@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 
 import matplotlib as mpl
 import numpy as np
@@ -133,19 +131,6 @@ def test_matplotlib_settings_are_left_alone(name, tmp_path):
     before = dict(mpl.rcParams)
     save_figure(FIGURES[name](), tmp_path / "figure", formats=["png"], dpi=50)
     assert dict(mpl.rcParams) == before
-
-
-def test_pyplot_is_never_imported():
-    code = """
-import sys
-from recipes.metrics import ConfidenceInterval
-from recipes.plots import interval_panels, save_figure
-import tempfile
-with tempfile.TemporaryDirectory() as folder:
-    save_figure(interval_panels({"expert": {"er": ConfidenceInterval(1.0, 0.5, 2.0)}}), folder + "/x")
-assert "matplotlib.pyplot" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 class TestNames:
