@@ -93,6 +93,7 @@ class LetGo:
 
     methods: str = one_of("trial", "all", "none")
     window: int = positive()
+    fall: float = positive()
 
 
 @dataclass

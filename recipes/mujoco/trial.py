@@ -18,8 +18,6 @@ from torchrl_priors.teacher_trial import TeacherTrial, TrialResult
 __all__ = ["LET_GO", "Students", "arms"]
 
 LET_GO = ", let go"
-FALL = 3.0
-"""Standard errors by which a student without its teacher is behind before the one who is kept goes on."""
 
 
 def arms(cfg: MujocoConfig) -> dict[str, MujocoConfig]:
@@ -103,12 +101,12 @@ class Students:
         if min(len(before), len(now)) < kept.plateau.min_episodes:
             return None
         fall, error = welch(before, now)
-        if fall <= max(FALL * error, kept.plateau.gain * abs(float(before.mean()))):
+        if fall <= max(self.cfg.let_go.fall * error, kept.plateau.gain * abs(float(before.mean()))):
             return None
         arms = {self.chosen.removesuffix(LET_GO): kept, self.chosen: student}
         frames = {arm: each.collector.frames for arm, each in arms.items()}
         returns = dict(zip(arms, (float(before.mean()), float(now.mean())), strict=True))
-        return TrialResult(next(iter(arms)), fall, NormalDist().cdf(FALL), frames, returns)
+        return TrialResult(next(iter(arms)), fall, NormalDist().cdf(self.cfg.let_go.fall), frames, returns)
 
     def _may_let_go(self) -> bool:
         """Whether the student's returns stand still, it is time to look, and a trial can still be decided."""

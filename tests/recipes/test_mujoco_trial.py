@@ -14,7 +14,6 @@ from safetensors.torch import load_file
 pytest.importorskip("mujoco")
 from mujoco_cases import interrupt, run
 
-from recipes.mujoco.trial import FALL
 from recipes.report.runs import find, name_priors, read, without_misfits
 from recipes.show_weight.episode import load_agent
 from torchrl_priors import Plateau, TeacherTrial
@@ -130,7 +129,7 @@ def test_a_student_who_let_go_and_fell_behind_gives_way_to_the_one_who_is_kept(s
     options = [*standing_still, "ppo.lr=1e-3", "total_frames=768"]
     with monkeypatch.context() as patch:
         always(patch, twin)
-        patch.setattr("recipes.mujoco.trial.welch", lambda before, now: (FALL * 1e9, 1e9 - 1))
+        patch.setattr("recipes.mujoco.trial.welch", lambda before, now: (3e9, 1e9 - 1))
         whole = run(tmp_path / "whole", *options)
         interrupt(patch, tmp_path / "stopped", 704, *options)  # it goes on from 640, after the fall
         run(tmp_path / "stopped", *options)
@@ -212,6 +211,7 @@ def test_a_trial_is_no_run_with_a_weight_to_show(trial, tmp_path):
         ("total_frames=192", "total_frames=192: expected at least 256, for a trial of 2 students"),
         ("let_go.methods=some", "let_go.methods=some"),
         ("let_go.window=0", "let_go.window=0"),
+        ("let_go.fall=0", "let_go.fall=0"),
     ],
 )
 def test_bad_input_is_refused_by_name_before_anything_is_written(override, message, trial, tmp_path):
