@@ -27,6 +27,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
 from recipes.common.checks import check_keys, positive
+from recipes.common.preemption import end_with_parent
 from recipes.common.sweeps import start
 from torchrl_priors.artifacts import read_manifest
 from torchrl_priors.atomic import write_atomically
@@ -227,7 +228,12 @@ def _start(run: StudyRun) -> subprocess.Popen:
     command = [sys.executable, "-m", "recipes.mujoco", *run.overrides, f"out={run.folder.resolve()}"]
     with (run.folder / "log.txt").open("w") as log:
         return subprocess.Popen(
-            command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env={**os.environ, "OMP_NUM_THREADS": "1"}
+            command,
+            cwd=ROOT,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            preexec_fn=end_with_parent,  # a study that goes on would find them at work
         )
 
 

@@ -1,7 +1,8 @@
-"""What a cluster sends to a job before it takes the machine away, and the way back into its queue."""
+"""Signals to a run: a cluster takes the machine away, and may queue the run again; what started it has ended."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -9,7 +10,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, NoReturn
 
-__all__ = ["Notice"]
+__all__ = ["Notice", "end_with_parent"]
+
+_PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent() -> None:
+    """Have Linux send SIGTERM to this process when the one that started it ends, even by force."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 class Notice:

@@ -107,6 +107,14 @@ def at_work(out: Path, progress: str) -> dict[int, Path]:
     return found
 
 
+def alive(pid: int) -> bool:
+    """Whether a process is at work, which one that waits to be noticed is not: of Linux only."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 def wait_for(something: Callable[[], object], process: subprocess.Popen) -> None:
     while not something():
         assert process.poll() is None, "the sweep ended"
