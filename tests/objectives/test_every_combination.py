@@ -144,11 +144,11 @@ def test_every_method_trains_in_the_vector_collector(method: str, device: str) -
 
 @pytest.fixture(scope="module", params=["discrete", "continuous"])
 def from_processes(request: pytest.FixtureRequest) -> tuple[bool, list[TensorDictBase]]:
-    """Starting processes takes seconds, so that the methods share what one pair of them, or one, collected."""
+    """Starting a process takes seconds, so that the methods share what one collected."""
     discrete = request.param == "discrete"
     torch.manual_seed(0)
     collector = MultiSyncCollector(
-        [make_discrete_env] * 2 if discrete else [make_continuous_env],
+        [make_discrete_env if discrete else make_continuous_env],
         make_actor(discrete),
         frames_per_batch=FRAMES,
         total_frames=2 * FRAMES,
