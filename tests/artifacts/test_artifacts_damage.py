@@ -33,42 +33,40 @@ def saved(tmp_path: Path) -> Saved:
 class TestDamage:
     """Small files, so that every byte can be damaged."""
 
-    @staticmethod
-    def tiny(path: Path) -> bytes:
+    @pytest.fixture(scope="class")
+    def tiny(self, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+        path = tmp_path_factory.mktemp("tiny") / "policy"
         prior = policy_prior(make_actor(2, 1, hidden=(2,)), RunningNorm(2))
         save_prior(path, prior, env_id="Hopper-v5", evaluation={"mean": 1.0})
         return path.read_bytes()
 
-    def test_every_flipped_byte_is_refused(self, tmp_path: Path) -> None:
-        data = self.tiny(tmp_path / "policy")
-        assert len(data) < 2500
-        for position in range(len(data)):
+    def test_every_flipped_byte_is_refused(self, tiny: bytes, tmp_path: Path) -> None:
+        assert len(tiny) < 2500
+        for position in range(len(tiny)):
             for mask in (0x01, 0x20):  # another number or letter, and the other case
-                damaged = bytearray(data)
+                damaged = bytearray(tiny)
                 damaged[position] ^= mask
                 (tmp_path / "damaged").write_bytes(damaged)
                 with pytest.raises(ArtifactError):
                     read_manifest(tmp_path / "damaged")
 
-    def test_every_truncation_is_refused(self, tmp_path: Path) -> None:
-        data = self.tiny(tmp_path / "policy")
-        for length in range(len(data)):
-            (tmp_path / "damaged").write_bytes(data[:length])
+    def test_every_truncation_is_refused(self, tiny: bytes, tmp_path: Path) -> None:
+        for length in range(len(tiny)):
+            (tmp_path / "damaged").write_bytes(tiny[:length])
             with pytest.raises(ArtifactError):
                 read_manifest(tmp_path / "damaged")
 
     @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
     @given(st.data())
-    def test_every_other_damage_is_refused(self, tmp_path: Path, data: st.DataObject) -> None:
-        original = self.tiny(tmp_path / "policy")
-        damaged = original
+    def test_every_other_damage_is_refused(self, tiny: bytes, tmp_path: Path, data: st.DataObject) -> None:
+        damaged = tiny
         for _ in range(data.draw(st.integers(1, 3))):
             start = data.draw(st.integers(0, len(damaged)))
             stop = data.draw(st.integers(start, min(start + 40, len(damaged))))
             middle = data.draw(st.binary(max_size=40) | st.just(damaged[start:stop] * 2))
             damaged = damaged[:start] + middle + damaged[stop:]
         (tmp_path / "damaged").write_bytes(damaged)
-        if damaged == original:
+        if damaged == tiny:
             read_manifest(tmp_path / "damaged")
         else:
             with pytest.raises(ArtifactError):

@@ -26,7 +26,7 @@ TINY = [
     "ppo.hidden=[8]",
     "evaluation.interval=64",
     "evaluation.episodes=2",
-    "checkpoint.interval=128",
+    "checkpoint.interval=1000000",
     "compile=false",
 ]
 
@@ -65,7 +65,7 @@ class Interrupted(BaseException):
 
 
 def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *overrides: str) -> None:
-    """Start a run that is broken off after the rollout that ends at ``frames``."""
+    """Start a run, with a checkpoint of every rollout, that is broken off after the one that ends at ``frames``."""
     log = Run.log
 
     def stopping(self, at, *args, **kwargs):
@@ -76,4 +76,4 @@ def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *override
     with monkeypatch.context() as patch:
         patch.setattr(Run, "log", stopping)
         with pytest.raises(Interrupted):
-            run(out, *overrides)
+            run(out, "checkpoint.interval=64", *overrides)

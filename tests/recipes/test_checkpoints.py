@@ -9,20 +9,10 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("mujoco")
-import mujoco_cases
+from mujoco_cases import interrupt, run
 
 from recipes.common import checkpoints as module
 from recipes.common.checkpoints import Checkpoints
-
-OFTEN = "checkpoint.interval=64"
-
-
-def run(out: Path, *overrides: str) -> None:
-    mujoco_cases.run(out, OFTEN, *overrides)
-
-
-def interrupt(monkeypatch: pytest.MonkeyPatch, out: Path, frames: int, *overrides: str) -> None:
-    mujoco_cases.interrupt(monkeypatch, out, frames, OFTEN, *overrides)
 
 
 @pytest.fixture(scope="module")

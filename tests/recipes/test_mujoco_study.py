@@ -135,7 +135,7 @@ def test_rows_are_in_one_order_whichever_run_ends_first(tmp_path):
 
 def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
     cfg = config(tmp_path, [ONE | {"seeds": [0, 1]}])
-    cfg.set.total_frames = "1280"
+    cfg.set = {**cfg.set, "total_frames": "1280", "checkpoint.interval": "64"}
     of_its_own = mujoco_study._start
 
     def start(run: StudyRun) -> subprocess.Popen | Here:

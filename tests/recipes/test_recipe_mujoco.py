@@ -87,7 +87,7 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
 ):
     if compiled and shutil.which("g++") is None and shutil.which("clang++") is None:
         pytest.skip("no C++ compiler")
-    options = [f"method={method}", "checkpoint.interval=128", f"compile={compiled}"]
+    options = [f"method={method}", f"compile={compiled}"]
     options += [] if method == "none" else [f"prior.path={teacher}", "prior.degrade=random"]
     whole = run(tmp_path / "whole", *options)
     if compiled:  # what is compiled is the very step
@@ -106,7 +106,8 @@ def test_an_interrupted_run_gives_the_evaluations_of_an_uninterrupted_one(
 def test_a_killed_process_continues_where_it_was(tmp_path):
     run(tmp_path / "whole", "total_frames=640", recorded=True)
     out = tmp_path / "killed"
-    command = [sys.executable, "-m", "recipes.mujoco", *TINY, "total_frames=640", f"out={out}"]
+    options = [*TINY, "checkpoint.interval=64", "total_frames=640", f"out={out}"]
+    command = [sys.executable, "-m", "recipes.mujoco", *options]
     process = subprocess.Popen(
         command, cwd=ROOT, env=with_another_hash_seed(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -159,8 +160,8 @@ def test_a_finished_run_is_not_run_again(teacher, capsys, monkeypatch):
 def test_resume_false_starts_anew_and_forgets_the_old_checkpoints(tmp_path, monkeypatch, capsys):
     run(tmp_path)
     whole = (tmp_path / "eval.csv").read_bytes()
-    interrupt(monkeypatch, tmp_path, 192, "resume=false")
-    assert [path.name[-3:] for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()] == ["128"]
+    interrupt(monkeypatch, tmp_path, 128, "resume=false")
+    assert [path.name[-3:] for path in (tmp_path / "checkpoints").iterdir() if path.is_dir()] == ["064"]
     run(tmp_path)
     assert (tmp_path / "eval.csv").read_bytes() == whole
     run(tmp_path, "resume=false")
@@ -258,7 +259,7 @@ def test_nan_losses_stop_the_run_and_keep_the_last_checkpoint(tmp_path, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr(agents.Optimiser, "__call__", broken)
         with pytest.raises(SystemExit, match="loss_objective became NaN") as error:
-            run(tmp_path)
+            run(tmp_path, "checkpoint.interval=64")
     assert "128" in str(error.value).rsplit("checkpoint", 1)[1]
     assert '"failed"' in (tmp_path / "status.json").read_text()
     run(tmp_path)  # the cause gone, it goes on from there
