@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ pytest.importorskip("mujoco")
 from composed import composed
 from hydra import compose, initialize_config_dir
 from mujoco_cases import ROOT, TINY, without_records
-from sweep_cases import wait_for
+from sweep_cases import alive, wait_for
 
 from recipes import mujoco_study
 from recipes.mujoco import train
@@ -155,6 +158,31 @@ def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
         patch.setattr(mujoco_study, "_start", Here)
         study(cfg)
     assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0, 1]
+
+
+STUDY = """
+import os, signal, sys
+from pathlib import Path
+from recipes.mujoco_study import StudyRun, _start
+
+out, sys.executable = sys.argv[1:]
+print(_start(StudyRun(("hopper", "none", "none", 0), (), Path(out))).pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a child")
+def test_a_study_that_is_killed_takes_its_runs_with_it(tmp_path):
+    nothing = tmp_path / "nothing"
+    nothing.write_text("#!/bin/sh\nexec sleep 600\n")
+    nothing.chmod(0o755)
+    command = [sys.executable, "-c", STUDY, str(tmp_path / "run"), str(nothing)]
+    killed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    deadline = time.monotonic() + 60
+    while alive(int(killed.stdout)):
+        assert time.monotonic() < deadline, "it goes on"
+        time.sleep(0.01)
 
 
 @pytest.mark.parametrize(

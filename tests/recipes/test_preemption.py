@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -15,7 +14,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("submitit")
 from mujoco_cases import ROOT, TINY, run
-from sweep_cases import alive, at_work, results, wait_for
+from sweep_cases import at_work, results, wait_for
 
 from recipes.common.preemption import Notice
 
@@ -65,23 +64,3 @@ def test_a_signal_that_nobody_would_queue_by_is_left_alone() -> None:
     notice = Notice(Mock())
     assert signal.getsignal(signal.SIGUSR2) == before
     notice.release()
-
-
-PARENT = """
-import os, signal, subprocess, sys
-from recipes.common.preemption import end_with_parent
-
-child = subprocess.Popen(["sleep", "600"], stdout=subprocess.DEVNULL, preexec_fn=end_with_parent)
-print(child.pid, flush=True)
-os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a child")
-def test_what_a_killed_study_started_ends_with_it() -> None:
-    parent = subprocess.run([sys.executable, "-c", PARENT], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert parent.returncode == -signal.SIGKILL, parent.stderr
-    deadline = time.monotonic() + 60
-    while alive(int(parent.stdout)):
-        assert time.monotonic() < deadline, "it goes on"
-        time.sleep(0.01)
