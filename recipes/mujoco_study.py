@@ -117,6 +117,7 @@ def _run(
     if label != chosen["method"]:
         overrides.append(f"label='{label}'")
     folder = Path(cfg.work) / env / f"{label.replace(' ', '-').replace('=', '')}-{teacher}-{seed}"
+    overrides.append("out='{}'".format(str(folder.resolve()).replace("'", "\\'")))  # Hydra reads ω in quotes only
     return StudyRun((env, teacher, label, seed), tuple(overrides), folder)
 
 
@@ -225,7 +226,7 @@ def run_missing(missing: Sequence[StudyRun], tables: Tables, workers: int) -> li
 
 def _start(run: StudyRun) -> subprocess.Popen:
     run.folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-m", "recipes.mujoco", *run.overrides, f"out={run.folder.resolve()}"]
+    command = [sys.executable, "-m", "recipes.mujoco", *run.overrides]
     with (run.folder / "log.txt").open("w") as log:
         return subprocess.Popen(
             command,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from recipes.metrics import ConfidenceInterval
 from recipes.plots import curve_panels, interval_panels, profile_panels
-from recipes.report.tables import ALL, Study
+from recipes.report.tables import ALL, Study, span
 
 __all__ = ["TRAINING", "curve_table", "figures"]
 
@@ -23,17 +23,14 @@ TRAINING = {
 """The paper's table: metrics, what they are called, and whether it gives the difference to the baseline."""
 
 _BASELINE = "PPO"
-#: Letters that fit above a panel.
-_TITLE = 30
 #: Points of a curve over training: rollouts are averaged down to this many.
 _POINTS = 50
 
 
-def _title(study: Study, env: str, prior: str) -> str:
+def _title(study: Study, env: str, prior: str, number: str = "") -> str:
     shown = "All environments" if env == ALL else env
-    title = f"{shown}, {prior}" if prior and len(study.priors) > 1 else shown
-    title += "" if env == ALL else f" (n = {study.number(env, prior)})"
-    return title if len(title) <= _TITLE else title.replace(", ", "\n", 1)
+    break_and_prior = f"\n{prior}" if prior and len(study.priors) > 1 else ""
+    return f"{shown}{break_and_prior} (n = {number or study.number(env, prior)})"
 
 
 def _columns(study: Study) -> int | None:
@@ -62,12 +59,14 @@ def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvemen
     if panels := _by_panel(study, ratios, shown, ["iqm", "ci_low", "ci_high"]):
         made["area_ratios"] = interval_panels(panels, columns=_with_all(study, panels))
         profiles = {
-            prior or "All runs": {
-                label: scores for label in study.labels if (scores := _profile(study, prior, label)) is not None
-            }
+            prior: {label: scores for label in study.labels if (scores := _profile(study, prior, label)) is not None}
             for prior in study.priors
         }
-        profiles = {prior: by_method for prior, by_method in profiles.items() if by_method}
+        profiles = {
+            f"{prior or 'All runs'} (n = {span(map(np.size, by_method.values()))})": by_method
+            for prior, by_method in profiles.items()
+            if by_method
+        }
         if profiles:
             boot = study.cfg.bootstrap
             made["performance_profiles"] = profile_panels(
@@ -108,7 +107,8 @@ def _by_panel(
         rows = table[(table["env"] == env) & (table["prior"] == prior)]
         if len(rows) and not (env == ALL and len(study.envs) == 1):
             values = rows[columns].to_numpy()
-            panels[_title(study, env, prior)] = {
+            number = span(rows["runs"]) if env == ALL else ""
+            panels[_title(study, env, prior, number)] = {
                 method: ConfidenceInterval(*row) for method, row in zip(rows["method"], values, strict=True)
             }
     return panels

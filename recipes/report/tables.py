@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from torchrl_priors.methods import METHODS
 __all__ = ["ALL", "Study", "dynamics_table", "improvement_table", "ratio_table", "return_table"]
 
 ALL = "all"
+_NUMBERS = re.compile(r"\d+\.?\d*")
 _PAPER = Path(__file__).with_name("paper_training_metrics.csv")
 
 
@@ -35,7 +37,7 @@ class Study:
 
     def __init__(self, runs: Sequence[FinishedRun], cfg: ReportConfig) -> None:
         self.cfg = cfg
-        self.notes: list[str] = []
+        self._noted: dict[str, dict[str, None]] = {}
         self._groups: dict[tuple[str, str, str], list[FinishedRun]] = {}
         for run in runs:
             self._groups.setdefault((run.env, run.prior, run.label), []).append(run)
@@ -46,10 +48,14 @@ class Study:
         # in the methods' order, whatever the environment that each was run in
         self.labels = list(dict.fromkeys(run.label for run in sorted(runs, key=_method_order)))
 
-    def note(self, text: str) -> None:
-        """Something that a reader has to know, said once."""
-        if text not in self.notes:
-            self.notes.append(text)
+    def note(self, text: str, label: str = "") -> None:
+        """Something that a reader has to know, said once; ``{}`` stands for all methods of which it is said."""
+        self._noted.setdefault(text, {})[label] = None
+
+    @property
+    def notes(self) -> list[str]:
+        """What was noted."""
+        return [text.replace("{}", ", ".join(labels)) for text, labels in self._noted.items()]
 
     def runs(self, env: str, prior: str, label: str) -> list[FinishedRun]:
         """The runs of a method, one a seed."""
@@ -69,8 +75,7 @@ class Study:
 
     def number(self, env: str, prior: str) -> str:
         """How many runs the methods of a panel have."""
-        counts = sorted({len(self.runs(env, prior, label)) for label in self.methods(env, prior)})
-        return "-".join(str(count) for count in (counts if len(counts) == 1 else (counts[0], counts[-1])))
+        return span(len(self.runs(env, prior, label)) for label in self.methods(env, prior))
 
     def teacher(self, env: str, prior: str) -> float | None:
         """Return of the teacher of a panel, where it is known."""
@@ -125,16 +130,23 @@ class Study:
         if absent or not seeds:
             if len(absent) < len(envs):
                 why = f"no area ratio in {', '.join(absent)}" if absent else "no seed common to all environments"
-                self.note(f"{label}{of(prior)} is not among the aggregates over environments: {why}.")
+                self.note(f"Aggregates over environments{of(prior)} are without {{}}: {why}.", label)
             return None
         if any(len(ratios) > len(seeds) for ratios in by_env.values()):
             numbers = ", ".join(map(str, seeds))
-            self.note(f"Aggregates of {label}{of(prior)} are over the seeds common to all environments: {numbers}.")
+            self.note(f"Aggregates of {{}}{of(prior)} are over the seeds common to all environments: {numbers}.", label)
         return np.array([[by_env[env][seed] for env in envs] for seed in seeds])
 
 
-def _method_order(run: FinishedRun) -> tuple[int, str]:
-    return [*METHODS, "trial"].index(run.method), run.label
+def _method_order(run: FinishedRun) -> tuple[int, list[float], str]:
+    settings = run.label.partition(" ")[2]  # from the largest to the smallest
+    return [*METHODS, "trial"].index(run.method), [-float(number) for number in _NUMBERS.findall(settings)], run.label
+
+
+def span(numbers: Iterable[int]) -> str:
+    """From the smallest to the largest number."""
+    known = sorted(numbers)
+    return "-".join(str(number) for number in dict.fromkeys((known[0], known[-1])))
 
 
 def of(prior: str) -> str:

@@ -36,7 +36,7 @@ class Here:
     """A run in this process, in the place of one of its own."""
 
     def __init__(self, run: StudyRun) -> None:
-        cfg = composed("mujoco", *run.overrides, f"out={run.folder}")
+        cfg = composed("mujoco", *run.overrides)
         self.returncode = 0
         try:
             with without_records():
@@ -65,6 +65,9 @@ def test_every_study_names_runs_that_differ(name):
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         runs = expand(compose("mujoco_study", overrides=[f"study_mujoco={name}"]))
     assert len({run.folder for run in runs}) == len({run.key for run in runs}) == len(runs) > 10
+    for run in {run.key[2]: run for run in runs}.values():
+        cfg = composed("mujoco", *run.overrides)
+        assert (cfg.label or cfg.method, Path(cfg.out)) == (run.key[2], run.folder.resolve())
 
 
 def test_blocks_stand_for_their_product_seed_by_seed(tmp_path):
