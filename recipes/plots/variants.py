@@ -1,4 +1,4 @@
-"""Variants of a method, as in ``"ae2r Cω=0.03"``: its colour, in another shade and another dash for each."""
+"""Variants of a method, as in ``"ae2r Cω=0.03"``: its colour, in a lighter shade and another dash for each."""
 
 from __future__ import annotations
 
@@ -27,10 +27,8 @@ def variant_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
     for name in names:
         family = [other for other in names if _base(other) == _base(name)]
         place = family.index(name)
-        light = 1.05 * place / (len(family) - 1) - 0.5 if len(family) > 2 else 0.4 * place
-        red, green, blue = (
-            part * (1 - abs(light)) + max(light, 0) for part in to_rgb(line_style(_base(name))["color"])
-        )
+        light = 0.55 * place / max(1, len(family) - 1) if len(family) > 2 else 0.4 * place
+        red, green, blue = (part * (1 - light) + light for part in to_rgb(line_style(_base(name))["color"]))
         style = {**line_style(_base(name)), "color": to_hex((red, green, blue))}
         if _base(name) != BASELINE:
             style["linestyle"] = _DASHES[place % len(_DASHES)]

@@ -23,6 +23,7 @@ GRIDWORLD, RUN, STUDY, REPORT, PAPER = (
     "A report",
     "The paper's numbers",
 )
+STUDIES = "|".join(sorted((file.stem for file in (ROOT / "conf/study_mujoco").glob("*.yaml")), reverse=True))
 SMALL = "worlds=2 teacher.steps=200 teacher.eval_episodes=1 evaluation.points=3 evaluation.interval=20"
 
 
@@ -73,7 +74,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], s
     tables = [columns(RUN, folder / name) for name in ("none", "ae2r", "trial")]
     tables += [columns(GRIDWORLD, folder / "gridworld")]
     tables += [columns(GRIDWORLD, path) for path in (ROOT / "results/gridworld").iterdir() if path.is_dir()]
-    tables += [columns(STUDY, ROOT / "results/mujoco", rename=r"^(trial_long|[a-z]+)(?=[_.])")]
+    tables += [columns(STUDY, ROOT / "results/mujoco", rename=rf"^({STUDIES})(?=[_.])")]
     tables += [columns(REPORT, path) for path in (ROOT / "results/mujoco").iterdir() if path.is_dir()]
     tables += [columns(PAPER, ROOT / "recipes" / name) for name in ("gridworld", "report")]
     for table in tables:
