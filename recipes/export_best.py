@@ -52,12 +52,14 @@ def export(cfg: ExportConfig) -> None:
     if not runs:
         others = "".join(f"\n  {run.path}: {run.reason}" for run in left_out)
         raise ValueError(f"No finished run of method={cfg.method} on env_id={cfg.env_id} in runs={cfg.runs}.{others}")
+    for entry in left_out:
+        print(f"Left out: {entry.path}: {entry.reason}", file=sys.stderr)
     runs.sort(key=last_return, reverse=True)
     for run in runs:
         print(f"{last_return(run):10.1f}  seed {run.seed}  {run.path}")
     best = runs[0].path / "policy.safetensors"
     manifest = read_manifest(best)
-    if manifest.env_id != cfg.env_id:
+    if manifest.env_id != cfg.env_id.split(" (")[0]:  # a policy does not say with which arguments its environment was
         raise ValueError(f"{best} is a policy for {manifest.env_id}, expected {cfg.env_id}.")
     write_atomically(Path(cfg.out), best.read_bytes())
     print(f"Written: {cfg.out}")

@@ -105,10 +105,9 @@ def _by_panel(
     panels = {}
     for env, prior in shown:
         rows = table[(table["env"] == env) & (table["prior"] == prior)]
-        if len(rows) and not (env == ALL and len(study.envs) == 1):
+        if len(rows):
             values = rows[columns].to_numpy()
-            number = span(rows["runs"]) if env == ALL else ""
-            panels[_title(study, env, prior, number)] = {
+            panels[_title(study, env, prior, span(rows["runs"]))] = {
                 method: ConfidenceInterval(*row) for method, row in zip(rows["method"], values, strict=True)
             }
     return panels

@@ -26,8 +26,8 @@ def interval(estimate: float, low: float, high: float, digits: int = 2) -> str:
 
 
 def plus_minus(mean: float, spread: float, digits: int = 2) -> str:
-    """A mean and a standard deviation."""
-    return "-" if mean is None or np.isnan(mean) else f"{number(mean, digits)} ± {number(spread, digits)}"
+    """A mean and its standard deviation, if it has one."""
+    return number(mean, digits) if np.isnan(spread) else f"{number(mean, digits)} ± {number(spread, digits)}"
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]], text_columns: int = 1) -> str:

@@ -155,7 +155,7 @@ def _page(
     if len(ratios := tables["area_ratio"]):
         versus = "of the same seed" if cfg.pairing == "seed" else "on average"
         parts += ["## Area ratios", f"(A - A₀)/|A₀|, where A₀ is the area of the baseline {versus}. IQM over seeds."]
-        shown = ratios.replace({"env": {ALL: "**all**"}}) if len(study.envs) > 1 else ratios[ratios["env"] != ALL]
+        shown = ratios.replace({"env": {ALL: "**all**"}})
         parts.append(pivot(shown, ["env", "prior"], lambda row: interval(*row[["iqm", "ci_low", "ci_high"]])))
         parts += [_figure(name) for name in ("area_ratios", "performance_profiles") if name in pictures]
     if len(improvement := tables["improvement"]):
@@ -203,7 +203,8 @@ def _dynamics(dynamics: pd.DataFrame) -> str:
             rows.append([env, prior or "-", method, *cells])
     head = ["env", "prior", "method", *(name for name, _ in TRAINING.values())]
     text = (
-        "Mean ± standard deviation over training and seeds; differences are to the baseline at the same frames. In "
+        "Mean ± standard deviation over training and seeds; differences are to the baseline at the same frames (from a "
+        "study's table: of means, without ±, and not of a trial's winner, which has fewer rollouts). In "
         "square brackets what the paper reports with its own teachers (v3 environments; which Cω is not said)."
     )
     return f"{text}\n\n{table(head, rows, text_columns=3)}"

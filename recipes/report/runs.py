@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from glob import glob
 from pathlib import Path
@@ -18,7 +19,17 @@ from omegaconf import OmegaConf
 from recipes.common.run_folder import RunFolder, flatten
 from torchrl_priors.methods import METHODS, MethodSpec, get_method
 
-__all__ = ["FinishedRun", "LeftOut", "find", "is_gridworld", "name_priors", "read", "short_paths", "without_misfits"]
+__all__ = [
+    "FinishedRun",
+    "LeftOut",
+    "find",
+    "is_gridworld",
+    "method_order",
+    "name_priors",
+    "read",
+    "short_paths",
+    "without_misfits",
+]
 
 
 @dataclass
@@ -33,6 +44,7 @@ class FinishedRun:
     settings: dict[str, Any]
     evaluations: pd.DataFrame
     metrics: pd.DataFrame
+    within: dict[str, float] = field(default_factory=dict)  # where metrics are means: their spread within the run
     teacher_return: float | None = None
     prior: str = ""  # how it is called; "" without one
     label: str = ""  # what it is called: its method if it says nothing else
@@ -285,8 +297,11 @@ def without_misfits(runs: Sequence[FinishedRun]) -> tuple[list[FinishedRun], lis
             left_out.append(LeftOut(run.path, f"it repeats {kept[key].path} (same method, prior and seed)"))
         else:
             kept[key] = run
-    order = [*METHODS, "trial"]
-    usable = sorted(
-        kept.values(), key=lambda run: (run.env, run.degraded, run.prior, order.index(run.method), run.label, run.seed)
-    )
+    usable = sorted(kept.values(), key=lambda run: (run.env, run.degraded, run.prior, method_order(run), run.seed))
     return usable, left_out
+
+
+def method_order(run: FinishedRun) -> tuple[int, list[float], str]:
+    """Methods in their order, and the settings of one from the largest to the smallest."""
+    numbers = re.findall(r"\d+\.?\d*", run.label.partition(" ")[2])
+    return [*METHODS, "trial"].index(run.method), [-float(number) for number in numbers], run.label

@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 from omegaconf import OmegaConf
 
-from recipes.mujoco_study import KEY
+from recipes.mujoco_study.tables import KEY, read_table
 from recipes.report.runs import FinishedRun, LeftOut, env_name
 from torchrl_priors.methods import METHODS
 
@@ -27,13 +27,14 @@ def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
     Raises:
         ValueError: it is another table, or a damaged one; the message names file and column.
     """
-    evaluations = _table(path, [*KEY, "frames", "return"])
+    evaluations = read_table(path, [*KEY, "frames", "return"])
     beside = path.with_name(f"{path.stem}_training.csv")
-    training = _table(beside, [*KEY, "metric", "mean"]) if beside.exists() else pd.DataFrame(columns=[*KEY, "metric"])
+    columns = [*KEY, "metric", "mean", "std", "rollouts"]
+    training = read_table(beside, columns) if beside.exists() else pd.DataFrame(columns=columns)
     beside = path.with_name(f"{path.stem}_teachers.csv")
-    teachers = _table(beside, ["env", "teacher", "return"]) if beside.exists() else pd.DataFrame()
+    teachers = read_table(beside, ["env", "teacher", "return"]) if beside.exists() else pd.DataFrame()
     levels = {(row.env, row.teacher): row[-1] for row in teachers.itertuples(index=False)}
-    means = {key: rows.set_index("metric")["mean"] for key, rows in training.groupby(KEY)} if len(training) else {}
+    measured = {key: rows.set_index("metric") for key, rows in training.groupby(KEY)}
     runs, left_out = [], []
     for key, rows in evaluations.groupby(KEY, sort=False):
         env, teacher, label, seed = key
@@ -41,7 +42,7 @@ def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
         if method not in {*METHODS, "trial"}:
             left_out.append(LeftOut(path, f"{env} {label}: there is no method {method!r}"))
             continue
-        measured = {name: [value] for name, value in means.get(key, {}).items()}
+        means = measured.get(key, training.set_index("metric").iloc[:0])
         runs.append(
             FinishedRun(
                 path=path,
@@ -51,7 +52,9 @@ def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
                 seed=int(seed),
                 settings={},
                 evaluations=rows[["frames", "return"]].rename(columns={"return": "mean_return"}),
-                metrics=pd.DataFrame({"frames": [int(rows["frames"].iloc[-1])]} | measured),
+                # means can be compared with those of as many rollouts: a trial's winner has fewer than the baseline
+                metrics=means[["mean"]].T.assign(frames=means["rollouts"].max()).reset_index(drop=True),
+                within=means["std"].to_dict(),
                 teacher_return=levels.get((env, teacher)),
                 prior="" if teacher == "none" else f"{teacher} teacher",
                 label=str(label),
@@ -64,19 +67,3 @@ def _env(name: str) -> str:
     """The environment of a file of ``conf/env``, as other reports call it; any other name as it is."""
     file = _ENVS / f"{name}.yaml"
     return env_name(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else name
-
-
-def _table(path: Path, needed: list[str]) -> pd.DataFrame:
-    try:
-        table = pd.read_csv(path, float_precision="round_trip", keep_default_na=False)
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from None
-    if absent := [name for name in needed if name not in table]:
-        raise ValueError(f"{path} is no table of a study: it has no column {', '.join(absent)}.")
-    for name in needed:
-        if name not in ("env", "teacher", "method", "metric"):
-            values = pd.to_numeric(table[name], errors="coerce")
-            if values.isna().any():
-                raise ValueError(f"{path}: {int(values.isna().sum())} values of {name} are no numbers.")
-            table[name] = values
-    return table

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,13 +19,11 @@ from recipes.metrics import (
     stratified_bootstrap_ci,
 )
 from recipes.report.config import ReportConfig
-from recipes.report.runs import FinishedRun
-from torchrl_priors.methods import METHODS
+from recipes.report.runs import FinishedRun, method_order
 
 __all__ = ["ALL", "Study", "dynamics_table", "improvement_table", "ratio_table", "return_table"]
 
 ALL = "all"
-_NUMBERS = re.compile(r"\d+\.?\d*")
 _PAPER = Path(__file__).with_name("paper_training_metrics.csv")
 
 
@@ -46,7 +44,7 @@ class Study:
         priors = dict.fromkeys(run.prior for run in sorted(runs, key=lambda run: run.degraded) if run.prior)
         self.priors = list(priors) or [""]
         # in the methods' order, whatever the environment that each was run in
-        self.labels = list(dict.fromkeys(run.label for run in sorted(runs, key=_method_order)))
+        self.labels = list(dict.fromkeys(run.label for run in sorted(runs, key=method_order)))
 
     def note(self, text: str, label: str = "") -> None:
         """Something that a reader has to know, said once; ``{}`` stands for all methods of which it is said."""
@@ -92,9 +90,9 @@ class Study:
                 if any(key[:2] == (env, prior) for key in self._groups):
                     yield env, prior
 
-    def interval(self, scores: np.ndarray) -> ConfidenceInterval:
+    def interval(self, scores: np.ndarray, aggregate: Callable[..., Any] = iqm) -> ConfidenceInterval:
         """IQM of ``[runs, tasks, *rest]`` and its stratified bootstrap interval, NaN where there are too few runs."""
-        interval = stratified_bootstrap_ci(scores, iqm, **bootstrap(self.cfg))
+        interval = stratified_bootstrap_ci(scores, aggregate, **bootstrap(self.cfg))
         none = np.full_like(interval.low, np.nan)
         return interval if len(scores) >= MIN_RUNS else interval._replace(low=none, high=none)
 
@@ -136,11 +134,6 @@ class Study:
             numbers = ", ".join(map(str, seeds))
             self.note(f"Aggregates of {{}}{of(prior)} are over the seeds common to all environments: {numbers}.", label)
         return np.array([[by_env[env][seed] for env in envs] for seed in seeds])
-
-
-def _method_order(run: FinishedRun) -> tuple[int, list[float], str]:
-    settings = run.label.partition(" ")[2]  # from the largest to the smallest
-    return [*METHODS, "trial"].index(run.method), [-float(number) for number in _NUMBERS.findall(settings)], run.label
 
 
 def span(numbers: Iterable[int]) -> str:
@@ -202,6 +195,7 @@ def ratio_table(study: Study) -> pd.DataFrame:
     rows += [
         (ALL, prior, label, len(scores), *study.interval(scores), np.nan, None)
         for prior in study.priors
+        if len([env for env, other in study.panels() if other == prior]) > 1
         for label in study.labels
         if label != study.cfg.baseline and (scores := study.across(prior, label)) is not None
     ]
@@ -238,7 +232,8 @@ def improvement_table(study: Study) -> pd.DataFrame:
 def dynamics_table(study: Study) -> pd.DataFrame:
     """Mean and standard deviation over training of what was logged, and of its difference to the baseline.
 
-    The difference is to the mean of the baseline's runs at the same frames; points of all runs count alike.
+    The difference is to the mean of the baseline's runs at the same frames; points of all runs count alike. Means over
+    training, as of a study's table, have no standard deviation of the difference, and none where rollouts differ.
     """
     rows = []
     for env, prior, label, runs in study.groups():
@@ -253,9 +248,14 @@ def dynamics_table(study: Study) -> pd.DataFrame:
                 else values.iloc[:0]
             )
             if len(values):
-                spread = (float(values.std(ddof=0)), gap.mean(), gap.std(ddof=0))
-                rows.append((env, prior, label, metric, len(runs), float(values.mean()), *spread))
-    columns = ["env", "prior", "method", "metric", "runs", "mean", "std", "difference", "difference_std"]
+                within = [run.within[metric] for run in runs if metric in run.within]
+                spread = float(np.hypot(values.std(ddof=0), np.sqrt(np.mean(np.square(within))) if within else 0))
+                spreads = (spread, gap.mean(), np.nan if within else gap.std(ddof=0))
+                means = np.array([run.metrics[metric].mean() for run in runs if metric in run.metrics])
+                ends = study.interval(means[np.isfinite(means)], np.mean)[1:]
+                rows.append((env, prior, label, metric, len(runs), float(values.mean()), *ends, *spreads))
+    columns = ["env", "prior", "method", "metric", "runs", "mean", "mean_ci_low", "mean_ci_high"]
+    columns += ["std", "difference", "difference_std"]
     return _with_paper(pd.DataFrame(rows, columns=columns), study)
 
 

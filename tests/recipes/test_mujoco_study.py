@@ -18,9 +18,12 @@ from hydra import compose, initialize_config_dir
 from mujoco_cases import ROOT, TINY, without_records
 from sweep_cases import alive, wait_for
 
-from recipes import mujoco_study
+from recipes.common.run_folder import write_file
 from recipes.mujoco import train
-from recipes.mujoco_study import KEY, StudyRun, Tables, expand, study
+from recipes.mujoco_study import tables, work
+from recipes.mujoco_study.__main__ import study
+from recipes.mujoco_study.plan import StudyRun, expand
+from recipes.mujoco_study.tables import KEY, Tables, own_return
 
 
 def config(tmp_path: Path, runs: list, **changes: Any) -> Any:
@@ -54,7 +57,7 @@ class Here:
 @pytest.fixture
 def here(monkeypatch) -> None:
     """No processes: only their number would differ."""
-    monkeypatch.setattr(mujoco_study, "_start", Here)
+    monkeypatch.setattr(work, "_start", Here)
 
 
 ONE = {"environments": ["hopper"], "methods": {"none": None}, "seeds": [0]}
@@ -89,12 +92,12 @@ def test_blocks_stand_for_their_product_seed_by_seed(tmp_path):
 def test_what_is_missing_is_run_and_what_failed_stops_nothing(tmp_path, capsys):
     broken = {"environments": ["hopper"], "methods": {"none": {"ppo.lr": -1}}, "seeds": [7]}
     cfg = config(tmp_path, [broken, ONE])
-    with pytest.raises(ValueError, match=r"1 of 2 runs failed:\nhopper none none seed 7: .*ppo\.lr=-1") as error:
+    with pytest.raises(ValueError, match=r"Not all runs are done:\nhopper none none seed 7: .*ppo\.lr=-1") as error:
         study(cfg)
     assert "log.txt" in str(error.value)
-    tables = {kind: pd.read_csv(tmp_path / f"tables/tiny{kind}.csv") for kind in ("", "_training")}
-    assert tables[""]["frames"].tolist() == [0, 64, 128, 192, 256]
-    assert set(tables["_training"]["metric"]) == {"loss_objective", "entropy"}
+    kept = {kind: pd.read_csv(tmp_path / f"tables/tiny{kind}.csv") for kind in ("", "_training")}
+    assert kept[""]["frames"].tolist() == [0, 64, 128, 192, 256]
+    assert set(kept["_training"]["metric"]) == {"loss_objective", "entropy"}
     before = (tmp_path / "tables/tiny.csv").read_bytes()
     (tmp_path / "work").rename(tmp_path / "gone")  # another machine
     capsys.readouterr()
@@ -119,12 +122,52 @@ def test_who_won_a_trial_is_in_a_table_of_its_own(tmp_path):
 
 
 @pytest.mark.usefixtures("here")
-def test_a_finished_run_that_is_not_in_the_tables_is_taken_in(tmp_path):
+def test_a_finished_run_is_taken_in_when_its_rows_are_lost_or_were_not_all_written(tmp_path, monkeypatch):
     study(config(tmp_path, [ONE]))
-    whole = (tmp_path / "tables/tiny.csv").read_bytes()
+    whole = {file: file.read_bytes() for file in (tmp_path / "tables").iterdir()}
     (tmp_path / "tables/tiny.csv").unlink()
-    study(config(tmp_path, [ONE], run=False))
-    assert (tmp_path / "tables/tiny.csv").read_bytes() == whole
+    study(config(tmp_path, [ONE]))
+    assert {file: file.read_bytes() for file in whole} == whole
+    (tmp_path / "tables").rename(tmp_path / "gone")
+
+    def killed(file: Path, content: str) -> None:
+        """While it writes the second table."""
+        if file.name == "tiny.csv":
+            raise KeyboardInterrupt
+        write_file(file, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tables, "write_file", killed)
+        with pytest.raises(KeyboardInterrupt):
+            study(config(tmp_path, [ONE]))
+    assert [file.name for file in (tmp_path / "tables").iterdir()] == ["tiny_training.csv"]
+    study(config(tmp_path, [ONE]))
+    assert {file: file.read_bytes() for file in whole} == whole
+
+
+@pytest.mark.usefixtures("here")
+def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path):
+    makers = ONE | {"seeds": [0, 1], "makes": "good"}
+    taught = {"environments": ["hopper"], "methods": {"e2r": None}, "teachers": ["good"], "seeds": [0]}
+    file = tmp_path / "made/hopper.safetensors"
+    change = {"teachers": {"good": {"prior.path": str(file).replace("hopper", "{env}")}}}
+    broken = makers | {"seeds": [1], "methods": {"none": {"ppo.lr": -1}}}
+    with pytest.raises(ValueError, match=r"seed 1: .*\n1 runs wait for prior.path=.*hopper.*the best of 1 more runs"):
+        study(config(tmp_path, [taught, makers | {"seeds": [0]}, broken], **change))
+    (tmp_path / "work").rename(tmp_path / "gone")  # another machine
+    study(config(tmp_path, [taught, makers], **change))
+    kept = pd.read_csv(tmp_path / "tables/tiny.csv").groupby(["method", "seed"])["return"].last()
+    assert kept.index.tolist() == [("e2r", 0), ("none", 0), ("none", 1)]
+    assert own_return(file) == pytest.approx(kept["none"].max())
+    assert pd.read_csv(tmp_path / "tables/tiny_teachers.csv")["return"].tolist() == [own_return(file)]
+    worse = f"hopper/none-none-{kept['none'].idxmin()}/policy.safetensors"
+    (policy,) = [tmp_path / name / worse for name in ("gone", "work") if (tmp_path / name / worse).exists()]
+    file.write_bytes(policy.read_bytes())
+    with pytest.raises(ValueError, match="put that file back"):
+        study(config(tmp_path, [taught | {"seeds": [1]}], **change))
+    file.unlink()
+    with pytest.raises(ValueError, match=r"1 runs wait for prior\.path=.*no such file"):
+        study(config(tmp_path, [taught | {"seeds": [1]}], **change))
 
 
 @pytest.mark.usefixtures("here")
@@ -132,9 +175,9 @@ def test_rows_are_in_one_order_whichever_run_ends_first(tmp_path):
     runs = expand(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
     study(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
     forth, back = (Tables(tmp_path / name, "t") for name in ("forth", "back"))
-    for tables, order in ((forth, runs), (back, runs[::-1])):
+    for kept, order in ((forth, runs), (back, runs[::-1])):
         for run in order:
-            tables.add(run)
+            kept.add(run)
     assert forth.files[""].read_bytes() == back.files[""].read_bytes()
     assert pd.read_csv(forth.files[""])[KEY].drop_duplicates()["seed"].tolist() == [0, 1]
 
@@ -142,7 +185,7 @@ def test_rows_are_in_one_order_whichever_run_ends_first(tmp_path):
 def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
     cfg = config(tmp_path, [ONE | {"seeds": [0, 1]}])
     cfg.set = {**cfg.set, "total_frames": "1280", "checkpoint.interval": "64"}
-    of_its_own = mujoco_study._start
+    of_its_own = work._start
 
     def start(run: StudyRun) -> subprocess.Popen | Here:
         """The first run is a process, which is killed when there is something to go on from."""
@@ -154,11 +197,11 @@ def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
         return process
 
     with monkeypatch.context() as patch:
-        patch.setattr(mujoco_study, "_start", start)
-        with pytest.raises(ValueError, match="1 of 2 runs failed:\nhopper none none seed 0: "):
+        patch.setattr(work, "_start", start)
+        with pytest.raises(ValueError, match="Not all runs are done:\nhopper none none seed 0: "):
             study(cfg)
         assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [1]
-        patch.setattr(mujoco_study, "_start", Here)
+        patch.setattr(work, "_start", Here)
         study(cfg)
     assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0, 1]
 
@@ -166,7 +209,8 @@ def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
 STUDY = """
 import os, signal, sys
 from pathlib import Path
-from recipes.mujoco_study import StudyRun, _start
+from recipes.mujoco_study.plan import StudyRun
+from recipes.mujoco_study.work import _start
 
 out, sys.executable = sys.argv[1:]
 print(_start(StudyRun(("hopper", "none", "none", 0), (), Path(out))).pid, flush=True)
@@ -194,6 +238,7 @@ def test_a_study_that_is_killed_takes_its_runs_with_it(tmp_path):
         ([{"environments": ["hopper"], "seeds": [0]}], r"runs\[0\]=.*expected .*methods"),
         ([ONE | {"method": "e2r"}], r"runs\[0\]"),
         ([ONE | {"teachers": ["best"]}], "teachers=best: expected one of good, weak, bad"),
+        ([ONE | {"makes": "best"}], "teachers=best: expected one of good, weak, bad"),
     ],
 )
 def test_bad_studies_are_refused_by_name(runs, message, tmp_path):

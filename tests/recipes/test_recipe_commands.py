@@ -24,7 +24,7 @@ REQUIRED = {
     "gridworld": [],
     "mujoco": [],
 }
-PACKAGES = {"report", "show_weight", "gridworld", "mujoco"}
+PACKAGES = {"report", "show_weight", "gridworld", "mujoco", "mujoco_study"}
 MAINS = {
     name: importlib.import_module(f"recipes.{name}.__main__" if name in PACKAGES else f"recipes.{name}").main
     for name in (*REQUIRED, "mujoco_study")

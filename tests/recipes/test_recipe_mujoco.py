@@ -298,3 +298,8 @@ def test_the_best_baseline_over_seeds_becomes_the_teacher(teacher, tmp_path):
     cfg.env_id = "Ant-v5"
     with pytest.raises(ValueError, match="No finished run of method=none on env_id=Ant-v5"):
         export(cfg)
+    config = out / "config.yaml"
+    config.write_text(config.read_text().replace("kwargs: {}", "kwargs: {ctrl_cost_weight: 0.1}"))
+    cfg.env_id = "Hopper-v5 (ctrl_cost_weight=0.1)"
+    export(cfg)
+    assert best.read_bytes() == (out / "policy.safetensors").read_bytes()

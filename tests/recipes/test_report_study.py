@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
@@ -38,11 +39,17 @@ def tables(tmp_path) -> Path:
             for seed in range(3):
                 key = (env, teacher, method, seed)
                 rows += [(*key, frames, level * frames / 2 + seed) for frames in (0, 1, 2)]
-                means += [(*key, "entropy", level), (*key, "loss_objective", -level)]
+                rollouts = 5 if method == "trial" else 9
+                means += [
+                    (*key, "entropy", level + seed, 4.0, rollouts),
+                    (*key, "loss_objective", -level, 0.0, rollouts),
+                ]
     names = ["env", "teacher", "method", "seed"]
     path = tmp_path / "deep.csv"
     pd.DataFrame(rows, columns=[*names, "frames", "return"]).to_csv(path, index=False)
-    pd.DataFrame(means, columns=[*names, "metric", "mean"]).to_csv(tmp_path / "deep_training.csv", index=False)
+    pd.DataFrame(means, columns=[*names, "metric", "mean", "std", "rollouts"]).to_csv(
+        tmp_path / "deep_training.csv", index=False
+    )
     return path
 
 
@@ -59,6 +66,18 @@ def test_returns_and_differences_come_from_the_tables(tables, tmp_path):
     dynamics = pd.read_csv(tmp_path / "out/dynamics.csv").set_index(["env", "method", "metric"])
     assert dynamics.loc[("Ant-v5", "e2r", "entropy"), "difference"] == 200
     assert dynamics.loc[("Ant-v5", "ae2r slow", "loss_objective"), "mean"] == -200
+    assert dynamics.loc[("Ant-v5", "e2r", "entropy"), "std"] == pytest.approx((4**2 + 2 / 3) ** 0.5)  # within, between
+    assert dynamics["difference_std"].isna().all()
+    assert dynamics.loc[("Ant-v5", "trial", "entropy"), "mean"] == 251
+    assert np.isnan(dynamics.loc[("Ant-v5", "trial", "entropy"), "difference"])  # of other rollouts than the baseline's
+
+
+def test_one_environment_is_not_all_of_them(tables, tmp_path):
+    rows = pd.read_csv(tables, keep_default_na=False)
+    rows[(rows["env"] == "hopper") | (rows["method"] == "none")].to_csv(tables, index=False)
+    report(config(tables, tmp_path / "out"))
+    ratios = pd.read_csv(tmp_path / "out/area_ratio.csv")
+    assert set(ratios["env"]) == {"Hopper-v5"}
 
 
 def test_there_is_no_interval_of_three_runs(tables, tmp_path):
@@ -92,6 +111,13 @@ def test_a_table_without_means_of_training_is_enough_for_returns(tables, tmp_pat
     tables.with_name("deep_training.csv").unlink()
     report(config(tables, tmp_path / "out"))
     assert (tmp_path / "out/returns.csv").exists()
+
+
+def test_settings_go_from_the_largest_to_the_smallest(tables, tmp_path):
+    text = tables.read_text()
+    tables.write_text(text.replace("e2r,", "ae2r x=0.3,").replace("ae2r slow,", "ae2r x=1,").replace("aae2r", "ae2r"))
+    page = report(config(tables, tmp_path / "out")).read_text()
+    assert "| env | prior | none | ae2r x=1 | ae2r x=0.3 | trial |" in page
 
 
 def test_a_method_that_is_unknown_is_left_out_by_name(tables, tmp_path, capsys):

@@ -1,0 +1,1 @@
+"""Many runs of the MuJoCo recipe as one study."""

@@ -1,0 +1,108 @@
+"""Doing what is missing of a study: each run in a process of its own, some at a time."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from recipes.common.preemption import end_with_parent
+from recipes.common.run_folder import write_file
+from recipes.mujoco_study.plan import ROOT, StudyRun
+from recipes.mujoco_study.tables import Tables, own_return
+
+__all__ = ["run_missing", "summary"]
+
+
+def summary(runs: Sequence[StudyRun], tables: Tables) -> Iterator[str]:
+    """How many runs of each environment are done, and which teachers are not there."""
+    finished = tables.finished()
+    for env in dict.fromkeys(run.key[0] for run in runs):
+        keys = [run.key for run in runs if run.key[0] == env]
+        yield f"{env}: {sum(key in finished for key in keys)} of {len(keys)} runs are in the tables"
+    yield from _waiting([run for run in runs if run.key not in finished], runs, finished)
+
+
+def run_missing(runs: Sequence[StudyRun], tables: Tables, workers: int) -> list[str]:
+    """Run what is missing; what failed, with its last words, and what could not start."""
+    finished = tables.finished()
+    waiting = [run for run in runs if run.key not in finished]
+    number, done = len(waiting), 0
+    failed: list[str] = []
+    at_work: dict[StudyRun, tuple[subprocess.Popen, float]] = {}
+    try:
+        while True:
+            able = [run for run in waiting if not _obstacle(run, runs, finished)]
+            for run in able[: workers - len(at_work)]:
+                waiting.remove(run)
+                at_work[run] = (_start(run), time.monotonic())
+            if not at_work:
+                return [*failed, *_waiting(waiting, runs, finished)]
+            for run, (process, start) in [*at_work.items()]:
+                if process.poll() is None:
+                    continue
+                del at_work[run]
+                done += 1
+                progress = f"{done} of {number}: {run}, {time.monotonic() - start:.0f} s"
+                try:
+                    print(f"{progress}, return {_take_in(run, process.returncode, tables):.1f}", flush=True)
+                    finished.add(run.key)
+                except (OSError, ValueError, KeyError) as error:
+                    failed.append(f"{run}: {error}")
+                    print(f"{progress}, failed", flush=True)
+            time.sleep(0.2)
+    finally:
+        for process, _ in at_work.values():
+            process.terminate()
+
+
+def _obstacle(run: StudyRun, runs: Sequence[StudyRun], finished: set[tuple]) -> str:
+    """Why a run cannot start yet: its teacher is not there, or not chosen from all of its candidates."""
+    if run.teacher is None:
+        return ""
+    if absent := [maker for maker in runs if maker.makes == run.teacher and maker.key not in finished]:
+        return f"the best of {len(absent)} more runs, as {absent[0]}"
+    return "" if run.teacher.is_file() else "no such file"
+
+
+def _waiting(waiting: Sequence[StudyRun], runs: Sequence[StudyRun], finished: set[tuple]) -> Iterator[str]:
+    """How many runs wait for what."""
+    obstacles = [(run.teacher, why) for run in waiting if (why := _obstacle(run, runs, finished))]
+    for file, why in (known := Counter(obstacles)):
+        yield f"{known[file, why]} runs wait for prior.path={file}: {why}"
+
+
+def _start(run: StudyRun) -> subprocess.Popen:
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with (run.folder / "log.txt").open("w") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "recipes.mujoco", *run.overrides],
+            cwd=ROOT,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            preexec_fn=end_with_parent,  # a study that goes on would find them at work
+        )
+
+
+def _take_in(run: StudyRun, code: int, tables: Tables) -> float:
+    """Keep what a run that has ended leaves, its policy first, if it is the best so far; its return."""
+    status = run.folder / "status.json"
+    if code or not status.exists() or json.loads(status.read_text())["state"] != "finished":
+        lines = (run.folder / "log.txt").read_text(errors="replace").replace("\r", "\n").strip().splitlines()
+        last = lines[-1] if lines else "nothing was printed"
+        raise ValueError(f"exit status {code}: {last} (see {run.folder / 'log.txt'})")
+    if run.makes is not None:
+        _keep_better(run.makes, run.folder / "policy.safetensors")
+    return tables.add(run)
+
+
+def _keep_better(teacher: Path, policy: Path) -> None:
+    """The paper's teacher is the baseline whose last evaluation is the best over the seeds."""
+    if not teacher.exists() or (own_return(teacher) or -float("inf")) < (own_return(policy) or -float("inf")):
+        write_file(teacher, policy.read_bytes())
