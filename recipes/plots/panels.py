@@ -5,7 +5,7 @@ A method may come with settings, as in ``"ae2r Cω=0.03"``: see :mod:`recipes.pl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,6 +31,7 @@ __all__ = ["curve_panels", "interval_panels", "profile_panels"]
 Places: TypeAlias = Mapping[str, tuple[int, int]]
 
 _INK = "#222222"
+_REFERENCE: dict[str, Any] = {"color": "0.45", "linewidth": 0.8, "linestyle": (0, (1, 1.5))}
 _MARKER: dict[str, Any] = {
     "marker": "D",
     "markersize": 3.6,
@@ -67,7 +68,7 @@ def curve_panels(
         share_y (bool): whether all panels have one scale, as those of one environment should. Defaults to ``False``.
         xlabel, ylabel (str): names of the axes.
         baseline (str, optional): what method ``none`` is called. Defaults to its usual name.
-        references: by title and name, a level to mark by a thin grey line with its name, e.g. the teacher's return.
+        references: by title and name, a level to mark by a thin grey line, e.g. the teacher's return.
 
     Returns:
         Figure: as wide as two columns, or one for a single panel.
@@ -88,26 +89,16 @@ def curve_panels(
             where = steps[title]
             x = np.asarray(where[name] if isinstance(where, Mapping) else where, dtype=np.float64)
             _draw_band(ax, x, curve, styles[name], f"curve {name!r} of {title!r}")
-        for name, level in (references or {}).get(title, {}).items():
-            ax.axhline(level, color="0.45", linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1.8)
-            ax.annotate(
-                name,
-                (0, level),
-                xycoords=("axes fraction", "data"),
-                xytext=(3, 1.5),
-                textcoords="offset points",
-                ha="left",  # where curves begin, most of them far below
-                va="bottom",
-                fontsize=6.5,
-                color="0.35",
-            )
+        for level in (references or {}).get(title, {}).values():
+            ax.axhline(level, **_REFERENCE, zorder=1.8)
         ax.set_title(title, linespacing=1.05)
         ax.margins(x=0)
         ax.xaxis.set_major_formatter(FuncFormatter(thousands))
         ax.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
         ax.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
     outer_labels(axes, xlabel, ylabel, share_y)
-    _legend(figure, styles, baseline)
+    marked = dict.fromkeys(name for levels in (references or {}).values() for name in levels)
+    _legend(figure, styles, baseline, [Line2D([], [], label=name, **_REFERENCE) for name in marked])
     return figure
 
 
@@ -285,8 +276,11 @@ def _draw_band(ax: Axes, x: Any, band: ConfidenceInterval, style: dict[str, Any]
     ax.plot(x, middle, solid_capstyle="round", **style, **marker)
 
 
-def _legend(figure: Figure, styles: dict[str, dict[str, Any]], baseline: str | None) -> None:
+def _legend(
+    figure: Figure, styles: dict[str, dict[str, Any]], baseline: str | None, more: Sequence[Line2D] = ()
+) -> None:
     handles = [Line2D([], [], label=variant_label(name, baseline), **style) for name, style in styles.items()]
+    handles += more
     # what fits: some six points a letter, and a line before each
     fits = int(figure.get_figwidth() * 72 / (34 + 4.4 * max(len(_plain(handle.get_label())) for handle in handles)))
     rows = -(-len(handles) // max(1, fits))

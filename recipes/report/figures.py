@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,10 +27,10 @@ _BASELINE = "PPO"
 _POINTS = 50
 
 
-def _title(study: Study, env: str, prior: str, number: str = "") -> str:
+def _title(study: Study, env: str, prior: str, number: str) -> str:
     shown = "All environments" if env == ALL else env
     break_and_prior = f"\n{prior}" if prior and len(study.priors) > 1 else ""
-    return f"{shown}{break_and_prior} (n = {number or study.number(env, prior)})"
+    return f"{shown}{break_and_prior} (n = {number})"
 
 
 def _columns(study: Study) -> int | None:
@@ -54,7 +54,15 @@ def curve_table(study: Study) -> pd.DataFrame:
 
 def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvement: pd.DataFrame) -> dict[str, Figure]:
     """What there is data for, by the name of the file."""
-    made: dict[str, Figure] = {"return_curves": _return_curves(study, curves)}
+    by_method: dict[str, list[str]] = {}
+    for label in study.labels:
+        by_method.setdefault(label.split()[0], []).append(label)
+    crowded = {method: labels for method, labels in by_method.items() if len(labels) > 2}
+    hidden = {label for labels in crowded.values() for label in labels[1:]}
+    made = {"return_curves": _return_curves(study, curves, [label for label in study.labels if label not in hidden])}
+    for method, labels in crowded.items():
+        with_whom = [label for label in study.cfg.compare if label != study.cfg.baseline and label not in labels]
+        made[f"return_curves_{method}"] = _return_curves(study, curves, [*with_whom, *labels])
     shown = [(env, prior) for prior in study.priors for env in (*study.envs, ALL)]
     if panels := _by_panel(study, ratios, shown, ["iqm", "ci_low", "ci_high"]):
         made["area_ratios"] = interval_panels(panels, columns=_with_all(study, panels))
@@ -113,17 +121,20 @@ def _by_panel(
     return panels
 
 
-def _return_curves(study: Study, curves: pd.DataFrame) -> Figure:
+def _return_curves(study: Study, curves: pd.DataFrame, labels: Sequence[str]) -> Figure:
     by_group = dict(iter(curves.groupby(["env", "prior", "method"], sort=False)))
     panels: dict[str, dict[str, ConfidenceInterval]] = {}
     steps: dict[str, np.ndarray] = {}
     teachers: dict[str, dict[str, float]] = {}
     for env, prior in study.panels():
-        title = _title(study, env, prior)
+        shown = [label for label in study.methods(env, prior) if label in labels]
+        if not shown:
+            continue
+        title = _title(study, env, prior, study.number(env, prior, shown))
         panels[title] = {}
         if (level := study.teacher(env, prior)) is not None:
-            teachers[title] = {"teacher": level}
-        for label in study.methods(env, prior):
+            teachers[title] = {"Teacher": level}
+        for label in shown:
             rows = by_group[env, study.runs(env, prior, label)[0].prior, label]
             panels[title][label] = ConfidenceInterval(*rows[["iqm", "ci_low", "ci_high"]].to_numpy().T)
             steps[title] = rows["frames"].to_numpy()
@@ -148,7 +159,7 @@ def _training(study: Study, metric: str, name: str, differs: bool) -> Figure | N
             if len(curves):
                 points = np.arange(len(curves)) * _POINTS // max(len(curves), _POINTS)
                 means = curves.groupby(points).mean()
-                title = _title(study, env, prior)
+                title = _title(study, env, prior, study.number(env, prior, study.methods(env, prior)))
                 seeds = means.to_numpy()
                 panels.setdefault(title, {})[label] = ConfidenceInterval(
                     seeds.mean(axis=1), seeds.min(axis=1), seeds.max(axis=1)

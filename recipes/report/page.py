@@ -144,7 +144,8 @@ def _page(
     parts.append(pivot(seeds.replace({"prior": {"": "-"}}), ["env", "prior"], lambda row: _seeds(row["seed"])))
     parts += [f"> {note}" for note in study.notes]
     parts += _left_out(left_out)
-    parts += ["## Returns", _figure("return_curves"), "Last evaluation, IQM over seeds:"]
+    parts += ["## Returns", *(_figure(name) for name in pictures if name.startswith("return_curves"))]
+    parts += ["Last evaluation, IQM over seeds:"]
     returns = tables["returns"].replace({"prior": {"": "-"}})
     last = pivot(
         returns, ["env", "prior"], lambda row: interval(row["final_iqm"], row["final_ci_low"], row["final_ci_high"], 1)
@@ -183,7 +184,7 @@ def _seeds(seeds: Sequence[int]) -> str:
 
 
 def _figure(name: str) -> str:
-    caption = _CAPTIONS["improvement" if name.startswith("improvement") else name]
+    caption = next(text for key, text in _CAPTIONS.items() if name.startswith(key))
     return f"![{caption}]({name}.png)"
 
 

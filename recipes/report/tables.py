@@ -71,9 +71,9 @@ class Study:
         """The methods with runs in an environment, the baselines included."""
         return [label for label in self.labels if self.runs(env, prior, label)]
 
-    def number(self, env: str, prior: str) -> str:
-        """How many runs the methods of a panel have."""
-        return span(len(self.runs(env, prior, label)) for label in self.methods(env, prior))
+    def number(self, env: str, prior: str, labels: Iterable[str]) -> str:
+        """How many runs some methods of a panel have."""
+        return span(len(self.runs(env, prior, label)) for label in labels)
 
     def teacher(self, env: str, prior: str) -> float | None:
         """Return of the teacher of a panel, where it is known."""

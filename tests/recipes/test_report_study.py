@@ -95,7 +95,7 @@ def test_the_teachers_return_is_a_line_where_a_table_tells_it(tables, tmp_path, 
     monkeypatch.setattr(figures, "curve_panels", lambda *args, **options: drawn.update(options) or Figure())
     report(config(tables, tmp_path / "out"))
     levels = drawn["references"]
-    assert list(levels.values()) == [{"teacher": 333.0}]
+    assert list(levels.values()) == [{"Teacher": 333.0}]
     assert next(iter(levels)).startswith("Hopper-v5")
     assert "n = 3" in next(iter(levels))
 
@@ -118,6 +118,20 @@ def test_settings_go_from_the_largest_to_the_smallest(tables, tmp_path):
     tables.write_text(text.replace("e2r,", "ae2r x=0.3,").replace("ae2r slow,", "ae2r x=1,").replace("aae2r", "ae2r"))
     page = report(config(tables, tmp_path / "out")).read_text()
     assert "| env | prior | none | ae2r x=1 | ae2r x=0.3 | trial |" in page
+
+
+def test_many_settings_of_a_method_have_a_figure_of_their_own(tables, tmp_path, monkeypatch):
+    rows = pd.read_csv(tables, keep_default_na=False)
+    slow = rows[rows["method"] == "ae2r slow"]
+    names = ["ae2r slow", "ae2r x=1", "ae2r x=0.3"]
+    pd.concat([rows, *(slow.assign(method=name) for name in names[1:])]).to_csv(tables, index=False)
+    drawn = []
+    monkeypatch.setattr(figures, "curve_panels", lambda panels, *args, **options: drawn.append(panels) or Figure())
+    page = report(config(tables, tmp_path / "out")).read_text()
+    whole, settings = ({name for panel in panels.values() for name in panel} for panels in drawn)
+    assert whole == {"none", "e2r", "ae2r slow", "trial"}
+    assert settings == {"e2r", *names}
+    assert "(return_curves_ae2r.png)" in page
 
 
 def test_a_method_that_is_unknown_is_left_out_by_name(tables, tmp_path, capsys):

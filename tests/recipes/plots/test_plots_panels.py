@@ -39,8 +39,9 @@ def test_curves_are_drawn_where_they_are() -> None:
 
 
 def test_a_reference_is_marked_by_name_at_its_level() -> None:
-    (ax,) = curve_panels({"Hopper": {"e2r": BAND}}, {"Hopper": STEPS}, references={"Hopper": {"Teacher": 2.5}}).axes
-    assert [text.get_text() for text in ax.texts] == ["Teacher"]
+    figure = curve_panels({"Hopper": {"e2r": BAND}}, {"Hopper": STEPS}, references={"Hopper": {"Teacher": 2.5}})
+    (ax,) = figure.axes
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["E2R", "Teacher"]
     assert any(set(line.get_ydata()) == {2.5} for line in ax.lines)
 
 
