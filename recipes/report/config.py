@@ -28,6 +28,7 @@ class ReportConfig:
 
     runs: Any = MISSING
     out: str = MISSING
+    envs: list[str] = MISSING
     baseline: str = MISSING
     compare: list[str] = MISSING
     pairing: str = one_of("seed", "mean")

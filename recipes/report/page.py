@@ -79,6 +79,9 @@ def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[FinishedRu
     for path in filter(is_study, folders):
         runs, unknown = read_study(path)
         found, left_out = found + runs, left_out + unknown
+    if absent := sorted(set(cfg.envs) - (known := {run.env for run in found})):
+        raise ValueError(f"envs={list(cfg.envs)}: there is no run in {', '.join(absent)}, but in {sorted(known)}.")
+    found = [run for run in found if not cfg.envs or run.env in cfg.envs]
     for run in found:
         run.label = cfg.rename.get(run.label, run.label)
     usable, misfits = without_misfits(found)
@@ -133,9 +136,10 @@ def _page(
 ) -> str:
     cfg, level = study.cfg, f"{100 * study.cfg.bootstrap.confidence:g} %"
     argument = given if isinstance(given, str) else f"[{','.join(map(str, given))}]"
+    chosen = f" envs='[{','.join(cfg.envs)}]'" if cfg.envs else ""
     parts = [
         "# Report",
-        f"```bash\npython -m recipes.report runs='{argument}' out={cfg.out}\n```",
+        f"```bash\npython -m recipes.report runs='{argument}'{chosen} out={cfg.out}\n```",
         f"{len(used)} runs. Intervals are {level} stratified bootstrap over seeds ({cfg.bootstrap.reps} resamples); "
         "IQM is the interquartile mean; with fewer than four seeds it is the mean, and there is no interval. "
         f"Area: mean return over the evaluations. Baseline: `{cfg.baseline}`.",

@@ -113,6 +113,17 @@ def test_a_table_without_means_of_training_is_enough_for_returns(tables, tmp_pat
     assert (tmp_path / "out/returns.csv").exists()
 
 
+def test_environments_can_be_chosen(tables, tmp_path):
+    cfg = config(tables, tmp_path / "out")
+    cfg.envs = ["Hopper-v5"]
+    page = report(cfg).read_text()
+    assert set(pd.read_csv(tmp_path / "out/returns.csv")["env"]) == {"Hopper-v5"}
+    assert "envs='[Hopper-v5]'" in page
+    cfg.envs = ["Hoper-v5"]
+    with pytest.raises(ValueError, match=r"envs=.*there is no run in Hoper-v5, but in \['Ant-v5', 'Hopper-v5'\]"):
+        report(cfg)
+
+
 def test_settings_go_from_the_largest_to_the_smallest(tables, tmp_path):
     text = tables.read_text()
     tables.write_text(text.replace("e2r,", "ae2r x=0.3,").replace("ae2r slow,", "ae2r x=1,").replace("aae2r", "ae2r"))
