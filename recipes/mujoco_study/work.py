@@ -37,10 +37,11 @@ def run_missing(runs: Sequence[StudyRun], tables: Tables, workers: int) -> list[
     at_work: dict[StudyRun, tuple[subprocess.Popen, float]] = {}
     try:
         while True:
-            able = [run for run in waiting if not _obstacle(run, runs, finished)]
-            for run in able[: workers - len(at_work)]:
-                waiting.remove(run)
-                at_work[run] = (_start(run), time.monotonic())
+            if len(at_work) < workers:
+                able = [run for run in waiting if not _obstacle(run, runs, finished)]
+                for run in able[: workers - len(at_work)]:
+                    waiting.remove(run)
+                    at_work[run] = (_start(run), time.monotonic())
             if not at_work:
                 return [*failed, *_waiting(waiting, runs, finished)]
             for run, (process, start) in [*at_work.items()]:
@@ -49,8 +50,10 @@ def run_missing(runs: Sequence[StudyRun], tables: Tables, workers: int) -> list[
                 del at_work[run]
                 done += 1
                 progress = f"{done} of {number}: {run}, {time.monotonic() - start:.0f} s"
+                in_use = {other.teacher for other in runs if other.key in finished}
                 try:
-                    print(f"{progress}, return {_take_in(run, process.returncode, tables):.1f}", flush=True)
+                    value = _take_in(run, process.returncode, tables, may_teach=run.makes not in in_use)
+                    print(f"{progress}, return {value:.1f}", flush=True)
                     finished.add(run.key)
                 except (OSError, ValueError, KeyError) as error:
                     failed.append(f"{run}: {error}")
@@ -90,14 +93,14 @@ def _start(run: StudyRun) -> subprocess.Popen:
         )
 
 
-def _take_in(run: StudyRun, code: int, tables: Tables) -> float:
-    """Keep what a run that has ended leaves, its policy first, if it is the best so far; its return."""
+def _take_in(run: StudyRun, code: int, tables: Tables, *, may_teach: bool) -> float:
+    """Keep what a run that has ended leaves, its policy first, if it may teach and is the best so far; its return."""
     status = run.folder / "status.json"
     if code or not status.exists() or json.loads(status.read_text())["state"] != "finished":
         lines = (run.folder / "log.txt").read_text(errors="replace").replace("\r", "\n").strip().splitlines()
         last = lines[-1] if lines else "nothing was printed"
         raise ValueError(f"exit status {code}: {last} (see {run.folder / 'log.txt'})")
-    if run.makes is not None:
+    if run.makes is not None and may_teach:
         _keep_better(run.makes, run.folder / "policy.safetensors")
     return tables.add(run)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
 import subprocess
 import sys
@@ -146,7 +147,7 @@ def test_a_finished_run_is_taken_in_when_its_rows_are_lost_or_were_not_all_writt
 
 
 @pytest.mark.usefixtures("here")
-def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path):
+def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path, monkeypatch):
     makers = ONE | {"seeds": [0, 1], "makes": "good"}
     taught = {"environments": ["hopper"], "methods": {"e2r": None}, "teachers": ["good"], "seeds": [0]}
     file = tmp_path / "made/hopper.safetensors"
@@ -160,6 +161,12 @@ def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path):
     assert kept.index.tolist() == [("e2r", 0), ("none", 0), ("none", 1)]
     assert own_return(file) == pytest.approx(kept["none"].max())
     assert pd.read_csv(tmp_path / "tables/tiny_teachers.csv")["return"].tolist() == [own_return(file)]
+    before = file.read_bytes()
+    better = itertools.count()  # each policy than the last
+    with monkeypatch.context() as patch:
+        patch.setattr(work, "own_return", lambda _: next(better))
+        study(config(tmp_path, [makers | {"seeds": [2]}, taught], **change))
+    assert file.read_bytes() == before  # for it has taught
     worse = f"hopper/none-none-{kept['none'].idxmin()}/policy.safetensors"
     (policy,) = [tmp_path / name / worse for name in ("gone", "work") if (tmp_path / name / worse).exists()]
     file.write_bytes(policy.read_bytes())
