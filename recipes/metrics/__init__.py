@@ -8,7 +8,7 @@ ran before.
 
 from recipes.metrics.area import RATIO_LIMIT, area_ratio, area_under_curve
 from recipes.metrics.bootstrap import iqm, mean_confidence_interval, stratified_bootstrap_ci
-from recipes.metrics.comparison import performance_profile, probability_of_improvement
+from recipes.metrics.comparison import performance_profile, probability_of_improvement, share_of_runs
 from recipes.metrics.interval import MIN_RUNS, ConfidenceInterval
 
 __all__ = [
@@ -21,5 +21,6 @@ __all__ = [
     "mean_confidence_interval",
     "performance_profile",
     "probability_of_improvement",
+    "share_of_runs",
     "stratified_bootstrap_ci",
 ]

@@ -1,7 +1,8 @@
-"""Distributions of scores side by side: performance profiles and the probability of improvement."""
+"""Distributions of scores side by side: performance profiles, the probability of improvement, shares of runs."""
 
 from __future__ import annotations
 
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy.typing as npt
 from recipes.metrics.bootstrap import stratified_bootstrap_ci
 from recipes.metrics.interval import CHUNK, Array, ConfidenceInterval, as_array, as_scores, interval, tails
 
-__all__ = ["performance_profile", "probability_of_improvement"]
+__all__ = ["performance_profile", "probability_of_improvement", "share_of_runs"]
 
 
 def performance_profile(
@@ -128,6 +129,39 @@ def probability_of_improvement(
             replicates[start : start + rows] += beaten.mean(1) / (2 * len(b))
     tasks = left.shape[1]
     return interval(estimate / tasks, replicates / tasks, quantiles)
+
+
+def share_of_runs(hits: Any, *, confidence: float = 0.95) -> ConfidenceInterval:
+    r"""Share of the runs of which something is true, and its interval, :math:`|\hat p - p| \leq z\sqrt{p(1-p)/n}`.
+
+    The interval is that of Wilson (1927). Unlike a bootstrap's it has a width where all runs agree, so it serves few
+    runs too.
+
+    Args:
+        hits: booleans, ``[runs]``.
+
+    Keyword Args:
+        confidence (float): in (0, 1). Defaults to 0.95.
+
+    Returns:
+        ConfidenceInterval: floats in [0, 1].
+
+    Raises:
+        ValueError: ``hits`` is empty or has another rank, or ``confidence`` is out of range.
+
+    Examples:
+        >>> share, low, high = share_of_runs([True, False, False, False])
+        >>> print(f"{share} ({low:.2f}, {high:.2f})")
+        0.25 (0.05, 0.70)
+    """
+    array, quantiles = as_array(hits, "hits"), tails(confidence)
+    if array.ndim != 1:
+        raise ValueError(f"Expected hits [runs], got {array.shape}.")
+    count, share, z = len(array), float((array != 0).mean()), NormalDist().inv_cdf(quantiles[1])
+    centre = share + z**2 / (2 * count)
+    half = z * float(np.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2))
+    low, high = ((centre + sign * half) / (1 + z**2 / count) for sign in (-1, 1))
+    return ConfidenceInterval(share, min(max(low, 0.0), share), max(min(high, 1.0), share))
 
 
 def _resample_counts(rng: np.random.Generator, rows: int, count: int) -> npt.NDArray[np.int64]:

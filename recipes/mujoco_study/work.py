@@ -69,7 +69,7 @@ def _obstacle(run: StudyRun, runs: Sequence[StudyRun], finished: set[tuple]) -> 
     if run.teacher is None:
         return ""
     if absent := [maker for maker in runs if maker.makes == run.teacher and maker.key not in finished]:
-        return f"the best of {len(absent)} more runs, as {absent[0]}"
+        return f"the best of {len(absent)} yet to run, as {absent[0]}"
     return "" if run.teacher.is_file() else "no such file"
 
 
@@ -77,7 +77,7 @@ def _waiting(waiting: Sequence[StudyRun], runs: Sequence[StudyRun], finished: se
     """How many runs wait for what."""
     obstacles = [(run.teacher, why) for run in waiting if (why := _obstacle(run, runs, finished))]
     for file, why in (known := Counter(obstacles)):
-        yield f"{known[file, why]} runs wait for prior.path={file}: {why}"
+        yield f"runs that wait for prior.path={file}: {known[file, why]} ({why})"
 
 
 def _start(run: StudyRun) -> subprocess.Popen:

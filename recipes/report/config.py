@@ -33,6 +33,7 @@ class ReportConfig:
     compare: list[str] = MISSING
     pairing: str = one_of("seed", "mean")
     rename: dict[str, str] = MISSING
+    change_from: float = MISSING
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
 
 
@@ -47,4 +48,5 @@ def check(cfg: ReportConfig) -> None:
     """
     check_keys(cfg)
     confidence = cfg.bootstrap.confidence
+    require(0 <= cfg.change_from < 1, "change_from", cfg.change_from, "a number in [0, 1)")
     require(0 < confidence < 1, "bootstrap.confidence", confidence, "a number in (0, 1)")

@@ -26,11 +26,13 @@ from recipes.report.runs import (
     short_paths,
     without_misfits,
 )
+from recipes.report.shares import BELOW, LOWER, share_table
 from recipes.report.study import is_study, read_study
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
 
 __all__ = ["report"]
 
+_DEFAULTS = Path(__file__).parents[2] / "conf" / "report.yaml"
 _CAPTIONS = {
     "return_curves": "Evaluation returns: interquartile mean over seeds, and the teacher's return",
     "area_ratios": "Area ratio to the baseline",
@@ -112,6 +114,7 @@ def _report_runs(
         "area_ratio": ratio_table(study),
         "improvement": improvement_table(study),
         "dynamics": dynamics_table(study),
+        "shares": share_table(study),
         "curves": curve_table(study),
         "left_out": pd.DataFrame([(str(entry.path), entry.reason) for entry in left_out], columns=["run", "reason"]),
     }
@@ -135,11 +138,9 @@ def _page(
     pictures: Sequence[str],
 ) -> str:
     cfg, level = study.cfg, f"{100 * study.cfg.bootstrap.confidence:g} %"
-    argument = given if isinstance(given, str) else f"[{','.join(map(str, given))}]"
-    chosen = f" envs='[{','.join(cfg.envs)}]'" if cfg.envs else ""
     parts = [
         "# Report",
-        f"```bash\npython -m recipes.report runs='{argument}'{chosen} out={cfg.out}\n```",
+        f"```bash\npython -m recipes.report runs={_argument(given)}{_changed(cfg)} out={cfg.out}\n```",
         f"{len(used)} runs. Intervals are {level} stratified bootstrap over seeds ({cfg.bootstrap.reps} resamples); "
         "IQM is the interquartile mean; with fewer than four seeds it is the mean, and there is no interval. "
         f"Area: mean return over the evaluations. Baseline: `{cfg.baseline}`.",
@@ -157,11 +158,22 @@ def _page(
     parts += [last, "Mean and standard deviation over seeds:"]
     parts.append(pivot(returns, ["env", "prior"], lambda row: plus_minus(row["final_mean"], row["final_std"], 1)))
 
+    parts += [f"Change of the return from {100 * cfg.change_from:g} % of the frames to the end, mean over seeds:"]
+    parts.append(
+        pivot(
+            returns,
+            ["env", "prior"],
+            lambda row: interval(row["change_mean"], row["change_ci_low"], row["change_ci_high"], 1),
+        )
+    )
+    parts += _shares(tables["shares"], LOWER, "Runs whose return is lower at the end than there")
+
     if len(ratios := tables["area_ratio"]):
         versus = "of the same seed" if cfg.pairing == "seed" else "on average"
         parts += ["## Area ratios", f"(A - A₀)/|A₀|, where A₀ is the area of the baseline {versus}. IQM over seeds."]
         shown = ratios.replace({"env": {ALL: "**all**"}})
         parts.append(pivot(shown, ["env", "prior"], lambda row: interval(*row[["iqm", "ci_low", "ci_high"]])))
+        parts += _shares(tables["shares"], BELOW, "Runs with a negative area ratio")
         parts += [_figure(name) for name in ("area_ratios", "performance_profiles") if name in pictures]
     if len(improvement := tables["improvement"]):
         parts += ["## Probability of improvement"]
@@ -179,6 +191,38 @@ def _page(
     files = ", ".join(f"[`{name}.csv`]({name}.csv)" for name in tables)
     parts.append(f"All numbers: {files}. Figures are there as PDF too.")
     return "\n\n".join(parts) + "\n"
+
+
+def _argument(value: Any) -> str:
+    """A value as it is given on the command line."""
+    if isinstance(value, dict):
+        return "'{" + ", ".join(f"{key}: {entry}" for key, entry in value.items()) + "}'"
+    if isinstance(value, list):
+        return f"'[{','.join(map(str, value))}]'"
+    return f"'{value}'" if isinstance(value, str) else f"{value:g}"
+
+
+def _changed(cfg: ReportConfig) -> str:
+    """The settings that differ from their defaults, ready to be given on the command line."""
+    known: Any = OmegaConf.to_container(OmegaConf.load(_DEFAULTS))
+    text = ""
+    given: Any = OmegaConf.to_container(cfg, resolve=True)
+    for name in ("envs", "baseline", "compare", "pairing", "change_from"):
+        text += f" {name}={_argument(given[name])}" if given[name] != known[name] else ""
+    text += f" +rename={_argument(given['rename'])}" if given["rename"] else ""
+    for name, value in given["bootstrap"].items():
+        text += f" bootstrap.{name}={_argument(value)}" if value != known["bootstrap"][name] else ""
+    return text
+
+
+def _shares(shares: pd.DataFrame, what: str, text: str) -> list[str]:
+    shown = shares[shares["what"] == what].replace({"env": {ALL: "**all**"}})
+    cells = pivot(
+        shown,
+        ["env", "prior"],
+        lambda row: interval(*row[["share", "ci_low", "ci_high"]]) + f", {row['count']} of {row['runs']}",
+    )
+    return [f"{text}, their share and its Wilson interval:", cells] if len(shown) else []
 
 
 def _seeds(seeds: Sequence[int]) -> str:

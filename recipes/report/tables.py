@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from recipes.metrics import (
 from recipes.report.config import ReportConfig
 from recipes.report.runs import FinishedRun, method_order
 
-__all__ = ["ALL", "Study", "dynamics_table", "improvement_table", "ratio_table", "return_table"]
+__all__ = ["ALL", "Study", "change", "dynamics_table", "improvement_table", "ratio_table", "return_table"]
 
 ALL = "all"
 _PAPER = Path(__file__).with_name("paper_training_metrics.csv")
@@ -162,18 +163,25 @@ def final(run: FinishedRun) -> float:
     return float(run.evaluations["mean_return"].iloc[-1])
 
 
+def change(study: Study, run: FinishedRun) -> float:
+    """What the last evaluation returns more than the first one from ``change_from`` of the frames on."""
+    late = run.evaluations["frames"] >= study.cfg.change_from * run.evaluations["frames"].iloc[-1]
+    return final(run) - float(run.evaluations["mean_return"][late].iloc[0])
+
+
 def return_table(study: Study) -> pd.DataFrame:
-    """Return of the last evaluation and mean return of all of them, with intervals over seeds."""
+    """Return of the last evaluation, how it changed and mean return of all of them, with intervals over seeds."""
     rows = []
     for env, prior, label, runs in study.groups():
         last, areas = np.array([final(run) for run in runs]), np.array([area(run) for run in runs])
         spread = last.std(ddof=1) if len(runs) > 1 else np.nan
         frames = int(runs[0].evaluations["frames"].iloc[-1])
-        rows.append(
-            (env, prior, label, len(runs), frames, *study.interval(last), last.mean(), spread, *study.interval(areas))
-        )
-    columns = ["env", "prior", "method", "runs", "frames", "final_iqm", "final_ci_low", "final_ci_high", "final_mean"]
-    return pd.DataFrame(rows, columns=[*columns, "final_std", "area_iqm", "area_ci_low", "area_ci_high"])
+        intervals = [study.interval(last), study.interval(areas)]
+        intervals.append(study.interval(np.array([change(study, run) for run in runs]), np.mean))
+        rows.append((env, prior, label, len(runs), frames, last.mean(), spread, *itertools.chain(*intervals)))
+    columns = ["env", "prior", "method", "runs", "frames", "final_mean", "final_std"]
+    columns += ["final_iqm", "final_ci_low", "final_ci_high", "area_iqm", "area_ci_low", "area_ci_high"]
+    return pd.DataFrame(rows, columns=[*columns, "change_mean", "change_ci_low", "change_ci_high"])
 
 
 def ratio_table(study: Study) -> pd.DataFrame:

@@ -153,7 +153,9 @@ def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path, monke
     file = tmp_path / "made/hopper.safetensors"
     change = {"teachers": {"good": {"prior.path": str(file).replace("hopper", "{env}")}}}
     broken = makers | {"seeds": [1], "methods": {"none": {"ppo.lr": -1}}}
-    with pytest.raises(ValueError, match=r"seed 1: .*\n1 runs wait for prior.path=.*hopper.*the best of 1 more runs"):
+    with pytest.raises(
+        ValueError, match=r"seed 1: .*\nruns that wait for prior.path=.*hopper.*: 1 \(the best of 1 yet to run"
+    ):
         study(config(tmp_path, [taught, makers | {"seeds": [0]}, broken], **change))
     (tmp_path / "work").rename(tmp_path / "gone")  # another machine
     study(config(tmp_path, [taught, makers], **change))
@@ -173,7 +175,7 @@ def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path, monke
     with pytest.raises(ValueError, match="put that file back"):
         study(config(tmp_path, [taught | {"seeds": [1]}], **change))
     file.unlink()
-    with pytest.raises(ValueError, match=r"1 runs wait for prior\.path=.*no such file"):
+    with pytest.raises(ValueError, match=r"runs that wait for prior\.path=.*: 1 \(no such file\)"):
         study(config(tmp_path, [taught | {"seeds": [1]}], **change))
 
 

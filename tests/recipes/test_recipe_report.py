@@ -40,7 +40,7 @@ def test_a_report_has_every_table_and_figure_and_names_what_it_left_out(tmp_path
     write_run(root / "dead", status={"state": "failed", "frames": 5, "error": "NaN in loss_objective"}, seed=7)
     page = report(config(f"runs={root}", f"out={tmp_path / 'out'}"))
     text, written = page.read_text(), {file.name for file in page.parent.iterdir()}
-    tables = {"returns", "area_ratio", "improvement", "dynamics", "curves", "left_out"}
+    tables = {"returns", "area_ratio", "improvement", "dynamics", "shares", "curves", "left_out"}
     pictures = {"return_curves", "area_ratios", "performance_profiles", "training_prior_weight"}
     pictures |= {"training_loss_objective", "training_entropy", "training_loss_prior"}
     pictures |= {"improvement_over_none", "improvement_over_e2r"}

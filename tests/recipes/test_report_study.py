@@ -72,6 +72,37 @@ def test_returns_and_differences_come_from_the_tables(tables, tmp_path):
     assert np.isnan(dynamics.loc[("Ant-v5", "trial", "entropy"), "difference"])  # of other rollouts than the baseline's
 
 
+def test_changes_of_returns_and_shares_of_runs_are_counted(tables, tmp_path):
+    rows = pd.read_csv(tables, keep_default_na=False)
+    falls = (rows["method"] == "e2r") & (rows["seed"] == 0) & (rows["env"] == "ant")
+    rows.loc[falls & (rows["frames"] == 2), "return"] = 140.0  # it had 150 at frame 1, as the baseline has 50
+    rows.loc[(rows["method"] == "ae2r slow") & (rows["seed"] == 1), "return"] -= 500
+    rows.to_csv(tables, index=False)
+    page = report(config(tables, tmp_path / "out")).read_text()
+    returns = pd.read_csv(tmp_path / "out/returns.csv").set_index(["env", "method"])
+    assert returns.loc[("Hopper-v5", "none"), "change_mean"] == 50  # from frame 1 of 2 on
+    assert returns.loc[("Ant-v5", "e2r"), "change_mean"] == pytest.approx((-10 + 150 + 150) / 3)
+    shares = pd.read_csv(tmp_path / "out/shares.csv").set_index(["what", "env", "method"])
+    assert shares.loc[("lower_at_the_end", "all", "e2r"), ["runs", "count"]].tolist() == [6, 1]
+    assert shares.loc[("below_baseline", "Ant-v5", "ae2r slow"), ["runs", "count"]].tolist() == [3, 1]
+    assert shares.loc[("below_baseline", "all", "ae2r slow"), "share"] == pytest.approx(1 / 3)
+    assert ("below_baseline", "all", "none") not in shares.index
+    assert "| **all** | good teacher | 0.00 (0.00, 0.39), 0 of 6 | 0.33 (0.10, 0.70), 2 of 6 |" in page
+
+
+def test_the_change_of_a_return_is_counted_from_where_it_is_asked(tables, tmp_path):
+    cfg = config(tables, tmp_path / "out")
+    cfg.change_from, cfg.rename = 0.0, {"ae2r slow": "AE2R"}
+    page = report(cfg).read_text()
+    options = "change_from=0 +rename='{ae2r slow: AE2R}' bootstrap.reps=20"
+    assert f"python -m recipes.report runs='{tables}' {options} out={tmp_path / 'out'}\n" in page
+    returns = pd.read_csv(tmp_path / "out/returns.csv").set_index(["env", "method"])
+    assert returns.loc[("Hopper-v5", "e2r"), "change_mean"] == 300
+    cfg.change_from = 1.0
+    with pytest.raises(ValueError, match=r"change_from=1.0: expected a number in \[0, 1\)"):
+        report(cfg)
+
+
 def test_one_environment_is_not_all_of_them(tables, tmp_path):
     rows = pd.read_csv(tables, keep_default_na=False)
     rows[(rows["env"] == "hopper") | (rows["method"] == "none")].to_csv(tables, index=False)

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,7 @@ from recipes.metrics import (
     mean_confidence_interval,
     performance_profile,
     probability_of_improvement,
+    share_of_runs,
     stratified_bootstrap_ci,
 )
 
@@ -285,3 +288,26 @@ def test_tensors_are_scores_too():
     scores = torch.tensor([[1.0, 2.0], [3.0, 5.0]], requires_grad=True)
     assert iqm(scores) == iqm(scores.tolist())
     assert area_ratio(scores[0], scores[1].detach()).shape == (2,)
+
+
+class TestShares:
+    @pytest.mark.parametrize(
+        ("count", "runs", "low", "high"),
+        [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (1, 10, 0.0179, 0.4042), (81, 263, 0.2553, 0.3662)],
+    )
+    def test_interval_is_that_of_wilson(self, count, runs, low, high):
+        """The last is an example that Newcombe (1998) works out."""
+        found = share_of_runs([True] * count + [False] * (runs - count))
+        assert found == pytest.approx((count / runs, low, high), abs=5e-5)
+
+    @given(st.lists(st.booleans(), min_size=1, max_size=60), st.floats(0.01, 0.99))
+    def test_ends_solve_the_equation_that_defines_them(self, hits, confidence):
+        share, low, high = share_of_runs(hits, confidence=confidence)
+        z = NormalDist().inv_cdf((1 + confidence) / 2)
+        for end in (low, high):
+            assert (share - end) ** 2 == pytest.approx(z**2 * end * (1 - end) / len(hits), abs=1e-9)
+        assert low <= share <= high
+
+    def test_runs_in_two_dimensions_are_refused(self):
+        with pytest.raises(ValueError, match=r"Expected hits \[runs\], got \(2, 1\)"):
+            share_of_runs([[True], [False]])
