@@ -65,19 +65,34 @@ def expand(cfg: StudyConfig) -> list[StudyRun]:
     """The runs that the configuration stands for, in its order, seed by seed.
 
     Raises:
-        ValueError: an unknown teacher, or a block that lacks an entry or has one too many; the message names it.
+        ValueError: an unknown teacher, a block that lacks an entry or has one too many or a wrong one, or a run with
+            two settings; the message names it.
     """
     found: dict[tuple, StudyRun] = {}
     for number, block in enumerate(cfg.runs):
         if not _NEEDED <= set(block) <= _KNOWN:
             raise ValueError(f"runs[{number}]={dict(block)}: expected {sorted(_NEEDED)}, and of {sorted(_KNOWN)} only.")
+        _check(f"runs[{number}]", block)
         for seed in _seeds(block["seeds"]):
             for env in block["environments"]:
                 for label, settings in block["methods"].items():
                     for teacher in block.get("teachers", ["none"]):
                         run = _run(cfg, block, env, teacher, label, settings or {}, seed)
-                        found.setdefault(run.key, run)
+                        if found.setdefault(run.key, run).overrides != run.overrides:
+                            raise ValueError(f"runs[{number}]: {run} is there with other settings already.")
     return list(found.values())
+
+
+def _check(name: str, block: Mapping) -> None:
+    """Refuse a block whose entries are of another kind."""
+    for key in ("environments", "teachers"):
+        if isinstance(block.get(key, []), str | Mapping):
+            raise ValueError(f"{name}.{key}={block[key]}: expected a list.")
+    if not isinstance(block["methods"], Mapping):
+        raise ValueError(f"{name}.methods={block['methods']}: expected settings by method.")
+    seeds = block["seeds"]
+    if set(seeds) != {"first", "number"} if isinstance(seeds, Mapping) else isinstance(seeds, int | str):
+        raise ValueError(f"{name}.seeds={seeds}: expected a list, or first and number.")
 
 
 def _seeds(seeds: Any) -> Sequence[int]:

@@ -66,7 +66,12 @@ class Tables:
         return set(self.rows("")[KEY].itertuples(index=False, name=None))
 
     def add(self, run: StudyRun) -> float:
-        """Take a finished run in; its last return."""
+        """Take a finished run in; its last return.
+
+        Raises:
+            ValueError: its teacher is not that of the other runs.
+        """
+        self.check_teachers([run])
         evaluations = pd.read_csv(run.folder / "eval.csv", float_precision="round_trip")
         columns = {"frames": "frames", "mean_return": "return", "std_return": "std", "episodes": "episodes"}
         metrics = pd.read_csv(run.folder / "metrics.csv", float_precision="round_trip")

@@ -69,7 +69,7 @@ def _obstacle(run: StudyRun, runs: Sequence[StudyRun], finished: set[tuple]) -> 
     if run.teacher is None:
         return ""
     if absent := [maker for maker in runs if maker.makes == run.teacher and maker.key not in finished]:
-        return f"the best of {len(absent)} yet to run, as {absent[0]}"
+        return f"its candidates have not all run, e.g. {absent[0]}; {len(absent)} are missing"
     return "" if run.teacher.is_file() else "no such file"
 
 
@@ -107,5 +107,6 @@ def _take_in(run: StudyRun, code: int, tables: Tables, *, may_teach: bool) -> fl
 
 def _keep_better(teacher: Path, policy: Path) -> None:
     """The paper's teacher is the baseline whose last evaluation is the best over the seeds."""
-    if not teacher.exists() or (own_return(teacher) or -float("inf")) < (own_return(policy) or -float("inf")):
+    before, now = (own_return(file) if file.exists() else None for file in (teacher, policy))
+    if before is None or (now is not None and now > before):
         write_file(teacher, policy.read_bytes())

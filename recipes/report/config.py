@@ -32,7 +32,6 @@ class ReportConfig:
     baseline: str = MISSING
     compare: list[str] = MISSING
     pairing: str = one_of("seed", "mean")
-    rename: dict[str, str] = MISSING
     change_from: float = MISSING
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
 

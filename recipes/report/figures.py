@@ -67,13 +67,9 @@ def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvemen
     if panels := _by_panel(study, ratios, shown, ["iqm", "ci_low", "ci_high"]):
         made["area_ratios"] = interval_panels(panels, columns=_with_all(study, panels))
         profiles = {
-            prior: {label: scores for label in study.labels if (scores := _profile(study, prior, label)) is not None}
+            f"{prior or 'All runs'} (n = {span(map(np.size, scores.values()))})": scores
             for prior in study.priors
-        }
-        profiles = {
-            f"{prior or 'All runs'} (n = {span(map(np.size, by_method.values()))})": by_method
-            for prior, by_method in profiles.items()
-            if by_method
+            if (scores := _profiles(study, prior))
         }
         if profiles:
             boot = study.cfg.bootstrap
@@ -97,8 +93,10 @@ def figures(study: Study, curves: pd.DataFrame, ratios: pd.DataFrame, improvemen
     return made
 
 
-def _profile(study: Study, prior: str, label: str) -> np.ndarray | None:
-    return None if label == study.cfg.baseline else study.across(prior, label)
+def _profiles(study: Study, prior: str) -> dict[str, np.ndarray]:
+    """The area ratios of each method that was run in all environments of a prior."""
+    students = [label for label in study.labels if label != study.cfg.baseline]
+    return {label: scores for label in students if (scores := study.across(prior, label)) is not None}
 
 
 def _with_all(study: Study, panels: Mapping[str, object]) -> int | None:

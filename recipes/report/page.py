@@ -10,9 +10,11 @@ from typing import Any
 import pandas as pd
 from omegaconf import OmegaConf
 
+from recipes.common.checks import require
 from recipes.common.run_folder import write_file
 from recipes.gridworld import page as gridworld
 from recipes.plots import save_figure
+from recipes.report.command import command
 from recipes.report.config import ReportConfig, check
 from recipes.report.figures import TRAINING, curve_table, figures
 from recipes.report.markdown import interval, pivot, plus_minus, table
@@ -29,10 +31,10 @@ from recipes.report.runs import (
 from recipes.report.shares import BELOW, LOWER, share_table
 from recipes.report.study import is_study, read_study
 from recipes.report.tables import ALL, Study, dynamics_table, improvement_table, ratio_table, return_table
+from torchrl_priors.methods import METHODS
 
 __all__ = ["report"]
 
-_DEFAULTS = Path(__file__).parents[2] / "conf" / "report.yaml"
 _CAPTIONS = {
     "return_curves": "Evaluation returns: interquartile mean over seeds, and the teacher's return",
     "area_ratios": "Area ratio to the baseline",
@@ -71,7 +73,7 @@ def report(cfg: ReportConfig) -> Path:
     if not usable and not pages:
         raise ValueError(f"runs={runs}: none of the {len(left_out)} runs can be used (see above).")
     if usable:
-        pages.insert(0, _report_runs(cfg, runs, usable, left_out, out))
+        pages.insert(0, _report_runs(cfg, usable, left_out, out))
     return _index(out, pages, left_out) if studies else pages[0]
 
 
@@ -84,8 +86,10 @@ def _usable(cfg: ReportConfig, folders: Sequence[Path]) -> tuple[list[FinishedRu
     if absent := sorted(set(cfg.envs) - (known := {run.env for run in found})):
         raise ValueError(f"envs={list(cfg.envs)}: there is no run in {', '.join(absent)}, but in {sorted(known)}.")
     found = [run for run in found if not cfg.envs or run.env in cfg.envs]
-    for run in found:
-        run.label = cfg.rename.get(run.label, run.label)
+    labels = {run.label for run in found}
+    for key, names in (("baseline", [cfg.baseline]), ("compare", cfg.compare)):
+        known = {*METHODS, "trial", *labels}
+        require(known.issuperset(names), key, getattr(cfg, key), f"of {', '.join(sorted(known))}")
     usable, misfits = without_misfits(found)
     return usable, left_out + misfits
 
@@ -105,9 +109,7 @@ def _left_out(entries: Sequence[LeftOut]) -> list[str]:
     return [heading, table(["run", "why"], rows, text_columns=2)]
 
 
-def _report_runs(
-    cfg: ReportConfig, given: str | list[str], usable: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path
-) -> Path:
+def _report_runs(cfg: ReportConfig, usable: Sequence[FinishedRun], left_out: Sequence[LeftOut], out: Path) -> Path:
     study = Study(usable, cfg)
     tables = {
         "returns": return_table(study),
@@ -125,13 +127,12 @@ def _report_runs(
         save_figure(figure, out / name)
     used = pd.DataFrame([(run.env, run.prior, run.label, run.seed) for run in usable])
     used.columns = ["env", "prior", "method", "seed"]
-    page = _page(study, given, used, tables, left_out, list(pictures))
+    page = _page(study, used, tables, left_out, list(pictures))
     return write_file(out / "report.md", page)
 
 
 def _page(
     study: Study,
-    given: str | list[str],
     used: pd.DataFrame,
     tables: dict[str, pd.DataFrame],
     left_out: Sequence[LeftOut],
@@ -140,7 +141,7 @@ def _page(
     cfg, level = study.cfg, f"{100 * study.cfg.bootstrap.confidence:g} %"
     parts = [
         "# Report",
-        f"```bash\npython -m recipes.report runs={_argument(given)}{_changed(cfg)} out={cfg.out}\n```",
+        f"```bash\n{command(cfg)}\n```",
         f"{len(used)} runs. Intervals are {level} stratified bootstrap over seeds ({cfg.bootstrap.reps} resamples); "
         "IQM is the interquartile mean; with fewer than four seeds it is the mean, and there is no interval. "
         f"Area: mean return over the evaluations. Baseline: `{cfg.baseline}`.",
@@ -158,7 +159,8 @@ def _page(
     parts += [last, "Mean and standard deviation over seeds:"]
     parts.append(pivot(returns, ["env", "prior"], lambda row: plus_minus(row["final_mean"], row["final_std"], 1)))
 
-    parts += [f"Change of the return from {100 * cfg.change_from:g} % of the frames to the end, mean over seeds:"]
+    start = f"{100 * cfg.change_from:g} % of the frames"
+    parts += [f"Change of the return from the first evaluation at {start} to the last one, mean over seeds:"]
     parts.append(
         pivot(
             returns,
@@ -166,7 +168,7 @@ def _page(
             lambda row: interval(row["change_mean"], row["change_ci_low"], row["change_ci_high"], 1),
         )
     )
-    parts += _shares(tables["shares"], LOWER, "Runs whose return is lower at the end than there")
+    parts += _shares(tables["shares"], LOWER, f"Runs that end below their return at {start}")
 
     if len(ratios := tables["area_ratio"]):
         versus = "of the same seed" if cfg.pairing == "seed" else "on average"
@@ -193,30 +195,8 @@ def _page(
     return "\n\n".join(parts) + "\n"
 
 
-def _argument(value: Any) -> str:
-    """A value as it is given on the command line."""
-    if isinstance(value, dict):
-        return "'{" + ", ".join(f"{key}: {entry}" for key, entry in value.items()) + "}'"
-    if isinstance(value, list):
-        return f"'[{','.join(map(str, value))}]'"
-    return f"'{value}'" if isinstance(value, str) else f"{value:g}"
-
-
-def _changed(cfg: ReportConfig) -> str:
-    """The settings that differ from their defaults, ready to be given on the command line."""
-    known: Any = OmegaConf.to_container(OmegaConf.load(_DEFAULTS))
-    text = ""
-    given: Any = OmegaConf.to_container(cfg, resolve=True)
-    for name in ("envs", "baseline", "compare", "pairing", "change_from"):
-        text += f" {name}={_argument(given[name])}" if given[name] != known[name] else ""
-    text += f" +rename={_argument(given['rename'])}" if given["rename"] else ""
-    for name, value in given["bootstrap"].items():
-        text += f" bootstrap.{name}={_argument(value)}" if value != known["bootstrap"][name] else ""
-    return text
-
-
 def _shares(shares: pd.DataFrame, what: str, text: str) -> list[str]:
-    shown = shares[shares["what"] == what].replace({"env": {ALL: "**all**"}})
+    shown = shares[shares["what"] == what].replace({"env": {ALL: "**all**"}, "prior": {"": "-"}})
     cells = pivot(
         shown,
         ["env", "prior"],

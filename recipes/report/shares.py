@@ -14,23 +14,22 @@ BELOW, LOWER = "below_baseline", "lower_at_the_end"
 
 
 def share_table(study: Study) -> pd.DataFrame:
-    """Shares per environment and over all of them; those of all count every run alike."""
+    """Shares per environment, and over all of them for a method that was run in all; there every run counts alike."""
+    found: dict[tuple[str, str, str], dict[str, np.ndarray]] = {}
+    for env, prior, label, runs in study.groups():
+        changes = np.array([change(run, study.cfg.change_from) for run in runs])
+        if np.isfinite(changes).all():
+            found.setdefault((LOWER, prior, label), {})[env] = changes < 0
+    for env, prior in study.panels():
+        for label in study.methods(env, prior):
+            if label != study.cfg.baseline and (ratios := study.ratios(env, prior, label)):
+                found.setdefault((BELOW, prior, label), {})[env] = np.array(list(ratios.values())) < 0
     rows = []
-    panels = [([env], prior) for env, prior in study.panels()]
-    envs = {prior: [env for env, other in study.panels() if other == prior] for prior in study.priors}
-    panels += [(chosen, prior) for prior, chosen in envs.items() if len(chosen) > 1]
-    for chosen, prior in panels:
-        for label in study.labels:
-            ratios = [ratio for env in chosen for ratio in study.ratios(env, prior, label).values()]
-            changes = [change(study, run) for env in chosen for run in study.runs(env, prior, label)]
-            found = {LOWER: np.array(changes) < 0}
-            if label != study.cfg.baseline:
-                found[BELOW] = np.array(ratios) < 0
-            rows += [
-                (chosen[0] if len(chosen) == 1 else ALL, prior, label, what, len(hits), int(hits.sum()), *share)
-                for what, hits in found.items()
-                if len(hits)
-                for share in [share_of_runs(hits, confidence=study.cfg.bootstrap.confidence)]
-            ]
-    columns = ["env", "prior", "method", "what", "runs", "count", "share", "ci_low", "ci_high"]
+    for (what, prior, label), by_env in found.items():
+        envs = study.envs_of(prior) if prior else study.envs
+        whole = {ALL: np.concatenate(list(by_env.values()))} if len(envs) > 1 and set(by_env) == set(envs) else {}
+        for env, hits in {**by_env, **whole}.items():
+            share = share_of_runs(hits, confidence=study.cfg.bootstrap.confidence)
+            rows.append((what, env, prior, label, len(hits), int(hits.sum()), *share))
+    columns = ["what", "env", "prior", "method", "runs", "count", "share", "ci_low", "ci_high"]
     return pd.DataFrame(rows, columns=columns)

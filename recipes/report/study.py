@@ -51,7 +51,7 @@ def read_study(path: Path) -> tuple[list[FinishedRun], list[LeftOut]]:
                 method=method,
                 seed=int(seed),
                 settings={},
-                evaluations=rows[["frames", "return"]].rename(columns={"return": "mean_return"}),
+                evaluations=rows.sort_values("frames")[["frames", "return"]].rename(columns={"return": "mean_return"}),
                 # means can be compared with those of as many rollouts: a trial's winner has fewer than the baseline
                 metrics=means[["mean"]].T.assign(frames=means["rollouts"].max()).reset_index(drop=True),
                 within=means["std"].to_dict(),

@@ -91,6 +91,10 @@ class Study:
                 if any(key[:2] == (env, prior) for key in self._groups):
                     yield env, prior
 
+    def envs_of(self, prior: str) -> list[str]:
+        """The environments that have runs with a prior."""
+        return [env for env, other in self.panels() if other == prior]
+
     def interval(self, scores: np.ndarray, aggregate: Callable[..., Any] = iqm) -> ConfidenceInterval:
         """IQM of ``[runs, tasks, *rest]`` and its stratified bootstrap interval, NaN where there are too few runs."""
         interval = stratified_bootstrap_ci(scores, aggregate, **bootstrap(self.cfg))
@@ -122,7 +126,7 @@ class Study:
 
     def across(self, prior: str, label: str) -> np.ndarray | None:
         """Area ratios ``[seeds, environments]`` of a method that was run in all environments of a prior, or None."""
-        envs = [env for env, other in self.panels() if other == prior]
+        envs = self.envs_of(prior)
         by_env = {env: self.ratios(env, prior, label) for env in envs}
         absent = [env for env in envs if not by_env[env]]
         seeds = sorted(set.intersection(*(set(ratios) for ratios in by_env.values()))) if envs else []
@@ -163,10 +167,11 @@ def final(run: FinishedRun) -> float:
     return float(run.evaluations["mean_return"].iloc[-1])
 
 
-def change(study: Study, run: FinishedRun) -> float:
-    """What the last evaluation returns more than the first one from ``change_from`` of the frames on."""
-    late = run.evaluations["frames"] >= study.cfg.change_from * run.evaluations["frames"].iloc[-1]
-    return final(run) - float(run.evaluations["mean_return"][late].iloc[0])
+def change(run: FinishedRun, start: float) -> float:
+    """The last return minus the first one from a share of the frames on; NaN where these are one."""
+    frames = run.evaluations["frames"]
+    late = run.evaluations["mean_return"][frames >= start * frames.iloc[-1] * (1 - 1e-9)]
+    return float(late.iloc[-1] - late.iloc[0]) if len(late) > 1 else np.nan
 
 
 def return_table(study: Study) -> pd.DataFrame:
@@ -176,8 +181,10 @@ def return_table(study: Study) -> pd.DataFrame:
         last, areas = np.array([final(run) for run in runs]), np.array([area(run) for run in runs])
         spread = last.std(ddof=1) if len(runs) > 1 else np.nan
         frames = int(runs[0].evaluations["frames"].iloc[-1])
+        changes = np.array([change(run, study.cfg.change_from) for run in runs])
+        known = np.isfinite(changes).all()
         intervals = [study.interval(last), study.interval(areas)]
-        intervals.append(study.interval(np.array([change(study, run) for run in runs]), np.mean))
+        intervals.append(study.interval(changes, np.mean) if known else ConfidenceInterval(*[np.nan] * 3))
         rows.append((env, prior, label, len(runs), frames, last.mean(), spread, *itertools.chain(*intervals)))
     columns = ["env", "prior", "method", "runs", "frames", "final_mean", "final_std"]
     columns += ["final_iqm", "final_ci_low", "final_ci_high", "area_iqm", "area_ci_low", "area_ci_high"]
@@ -203,7 +210,7 @@ def ratio_table(study: Study) -> pd.DataFrame:
     rows += [
         (ALL, prior, label, len(scores), *study.interval(scores), np.nan, None)
         for prior in study.priors
-        if len([env for env, other in study.panels() if other == prior]) > 1
+        if len(study.envs_of(prior)) > 1
         for label in study.labels
         if label != study.cfg.baseline and (scores := study.across(prior, label)) is not None
     ]
@@ -217,9 +224,8 @@ def improvement_table(study: Study) -> pd.DataFrame:
     Over all environments it is the mean of theirs, from the seeds that a method has in all of them.
     """
     rows = []
-    envs = {prior: [env for env, other in study.panels() if other == prior] for prior in study.priors}
     groups = [([env], prior) for env, prior in study.panels()]
-    groups += [(envs[prior], prior) for prior in study.priors if len(envs[prior]) > 1]
+    groups += [(envs, prior) for prior in study.priors if len(envs := study.envs_of(prior)) > 1]
     for chosen, prior in groups:
         env = chosen[0] if len(chosen) == 1 else ALL
         for reference in study.cfg.compare:

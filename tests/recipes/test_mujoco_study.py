@@ -154,7 +154,7 @@ def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path, monke
     change = {"teachers": {"good": {"prior.path": str(file).replace("hopper", "{env}")}}}
     broken = makers | {"seeds": [1], "methods": {"none": {"ppo.lr": -1}}}
     with pytest.raises(
-        ValueError, match=r"seed 1: .*\nruns that wait for prior.path=.*hopper.*: 1 \(the best of 1 yet to run"
+        ValueError, match=r"seed 1: .*\nruns that wait for prior.path=.*hopper.*: 1 \(its candidates .*; 1 are missing"
     ):
         study(config(tmp_path, [taught, makers | {"seeds": [0]}, broken], **change))
     (tmp_path / "work").rename(tmp_path / "gone")  # another machine
@@ -248,6 +248,10 @@ def test_a_study_that_is_killed_takes_its_runs_with_it(tmp_path):
         ([ONE | {"method": "e2r"}], r"runs\[0\]"),
         ([ONE | {"teachers": ["best"]}], "teachers=best: expected one of good, weak, bad"),
         ([ONE | {"makes": "best"}], "teachers=best: expected one of good, weak, bad"),
+        ([ONE | {"environments": "hopper"}], r"runs\[0\].environments=hopper: expected a list"),
+        ([ONE | {"methods": ["none"]}], r"runs\[0\].methods=\['none'\]: expected settings by method"),
+        ([ONE | {"seeds": {"first": 0}}], r"runs\[0\].seeds=.*: expected a list, or first and number"),
+        ([ONE, ONE | {"set": {"ppo.lr": 1}}], r"runs\[1\]: hopper none none seed 0 is there with other settings"),
     ],
 )
 def test_bad_studies_are_refused_by_name(runs, message, tmp_path):

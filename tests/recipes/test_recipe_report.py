@@ -94,13 +94,6 @@ def test_a_run_that_is_older_than_a_setting_is_like_the_others(tmp_path: Path) -
     assert study_of(tmp_path).labels == ["e2r"]
 
 
-def test_a_label_can_be_renamed(tmp_path: Path) -> None:
-    write_run(tmp_path / "runs" / "a", method="e2r", config={"label": "mine"})
-    out = tmp_path / "out"
-    report(config(f"runs={tmp_path / 'runs'}", f"out={out}", "+rename.mine=ours"))
-    assert set(pd.read_csv(out / "returns.csv")["method"]) == {"ours"}
-
-
 def test_teachers_of_one_environment_are_told_apart_by_their_files(tmp_path: Path) -> None:
     for name in ("hopper-1", "hopper-2"):
         settings = {"prior": {"path": f"runs/{name}/policy.safetensors", "degrade": "none"}}
@@ -255,7 +248,10 @@ def test_runs_are_found_in_folders_globs_and_lists(tmp_path: Path) -> None:
         find(str(tmp_path / "nowhere"))
 
 
-@pytest.mark.parametrize("override", ["pairing=none", "bootstrap.reps=0", "bootstrap.confidence=95"])
+@pytest.mark.parametrize(
+    "override",
+    ["pairing=none", "bootstrap.reps=0", "bootstrap.confidence=95", "change_from=1", "baseline=nne", "compare=[ppo]"],
+)
 def test_a_wrong_key_is_refused_by_name(tmp_path: Path, override: str) -> None:
     write_run(tmp_path / "a")
     with pytest.raises(ValueError, match=override.split("=")[0]):

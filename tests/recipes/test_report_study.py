@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -92,15 +93,29 @@ def test_changes_of_returns_and_shares_of_runs_are_counted(tables, tmp_path):
 
 def test_the_change_of_a_return_is_counted_from_where_it_is_asked(tables, tmp_path):
     cfg = config(tables, tmp_path / "out")
-    cfg.change_from, cfg.rename = 0.0, {"ae2r slow": "AE2R"}
-    page = report(cfg).read_text()
-    options = "change_from=0 +rename='{ae2r slow: AE2R}' bootstrap.reps=20"
-    assert f"python -m recipes.report runs='{tables}' {options} out={tmp_path / 'out'}\n" in page
+    cfg.change_from = 0.0
+    report(cfg)
     returns = pd.read_csv(tmp_path / "out/returns.csv").set_index(["env", "method"])
     assert returns.loc[("Hopper-v5", "e2r"), "change_mean"] == 300
+    cfg.change_from = 0.9  # of two points only the last is left
+    report(cfg)
+    assert pd.read_csv(tmp_path / "out/returns.csv")["change_mean"].isna().all()
+    assert set(pd.read_csv(tmp_path / "out/shares.csv")["what"]) == {"below_baseline"}
     cfg.change_from = 1.0
     with pytest.raises(ValueError, match=r"change_from=1.0: expected a number in \[0, 1\)"):
         report(cfg)
+
+
+def test_the_command_of_a_report_makes_it_again(tables, tmp_path):
+    tables.write_text(tables.read_text().replace("ae2r slow", "ae2r Cω=1"))
+    cfg = config(tables, tmp_path / "out")
+    cfg.out = str(tmp_path / "an 'out', of x=1")
+    cfg.change_from, cfg.compare, cfg.envs = 0.0, ["ae2r Cω=1", "none"], ["Hopper-v5"]
+    (line,) = (line for line in report(cfg).read_text().splitlines() if line.startswith("python"))
+    words = shlex.split(line)
+    assert words[:3] == ["python", "-m", "recipes.report"]
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        assert compose("report", overrides=words[3:]) == cfg
 
 
 def test_one_environment_is_not_all_of_them(tables, tmp_path):
@@ -149,7 +164,7 @@ def test_environments_can_be_chosen(tables, tmp_path):
     cfg.envs = ["Hopper-v5"]
     page = report(cfg).read_text()
     assert set(pd.read_csv(tmp_path / "out/returns.csv")["env"]) == {"Hopper-v5"}
-    assert "envs='[Hopper-v5]'" in page
+    assert " 'envs=[Hopper-v5]' " in page
     cfg.envs = ["Hoper-v5"]
     with pytest.raises(ValueError, match=r"envs=.*there is no run in Hoper-v5, but in \['Ant-v5', 'Hopper-v5'\]"):
         report(cfg)
