@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from recipes.common.checks import at_home
 from torchrl_priors.atomic import write_atomically
 
-__all__ = ["RunFolder", "digest", "flatten", "read_json", "refuse_foreign", "sha256", "write_file"]
+__all__ = ["RunFolder", "digest", "flatten", "keep_others_out", "read_json", "refuse_foreign", "sha256", "write_file"]
 
 #: Temporary names: of the atomic writer, and of TorchRL's checkpoints (being written or removed).
 _LEFTOVERS = (".*.partial", "*/.*.partial", "checkpoints/.checkpoint-*")
@@ -78,6 +78,23 @@ def write_file(file: Path, content: str | bytes) -> Path:
     return file
 
 
+def keep_others_out(file: Path, refusal: str) -> FileLock:
+    """A lock that is held until it is released or its process ends; on a file system without locks, for nothing.
+
+    Raises:
+        ValueError: another process holds it; the message begins with ``refusal``.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(file)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        raise ValueError(f"{refusal}. Wait for it, end it, or choose another.") from None
+    except (NotImplementedError, OSError):
+        pass
+    return lock
+
+
 class RunFolder:
     """A folder for the results of one configuration, to be continued by the same configuration only.
 
@@ -107,7 +124,7 @@ class RunFolder:
                 self._check_same(read_json(stamp), config, may_grow)
             elif (path / "config.yaml").exists():
                 raise ValueError(f"out={path} holds a config.yaml that is not of this recipe: choose another folder.")
-            self._keep_others_out()
+            self._lock = keep_others_out(path / ".lock", f"out={path}: another process is at work in this folder")
             if known:
                 self._remove_leftovers()
             # first what makes the folder this recipe's: it may be killed in between
@@ -129,17 +146,6 @@ class RunFolder:
                 f"out={self.path} holds results of another configuration ({'; '.join(changed)}): choose another "
                 "folder, or leave `out` to its default, which differs for each configuration."
             )
-
-    def _keep_others_out(self) -> None:
-        self._lock = FileLock(self.path / ".lock")
-        try:
-            self._lock.acquire(blocking=False)
-        except Timeout:
-            raise ValueError(
-                f"out={self.path}: another process is at work in this folder. Wait for it, end it, or choose another."
-            ) from None
-        except (NotImplementedError, OSError):
-            pass  # a file system without locks
 
     def release(self) -> None:
         """Let others work in the folder."""

@@ -18,6 +18,7 @@ import hydra
 from omegaconf import OmegaConf
 
 from recipes.common.checks import check_keys
+from recipes.common.run_folder import keep_others_out
 from recipes.common.sweeps import start
 from recipes.mujoco_study.plan import StudyConfig, expand
 from recipes.mujoco_study.tables import Tables
@@ -28,15 +29,22 @@ def study(cfg: StudyConfig) -> None:
     """Say what is missing, and run it.
 
     Raises:
-        ValueError: bad input, or runs that failed; the message names them.
+        ValueError: bad input, another study at work on these tables, or runs that failed; the message names them.
     """
     check_keys(cfg)
     runs, tables = expand(cfg), Tables(Path(cfg.out), cfg.name)
     tables.check_teachers(runs)
     for line in summary(runs, tables):
         print(line, flush=True)
-    if cfg.run and (failed := run_missing(runs, tables, cfg.workers)):
-        raise ValueError("\n".join(["Not all runs are done:", *failed]))
+    if not cfg.run:
+        return
+    file = Path(cfg.out) / f".{cfg.name}.lock"
+    lock = keep_others_out(file, f"out={cfg.out} name={cfg.name}: another study is at work on these tables")
+    try:
+        if failed := run_missing(runs, tables, cfg.workers):
+            raise ValueError("\n".join(["Not all runs are done:", *failed]))
+    finally:
+        lock.release()
 
 
 @hydra.main(version_base="1.3", config_path="../../conf", config_name="mujoco_study")

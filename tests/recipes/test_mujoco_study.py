@@ -141,7 +141,7 @@ def test_a_finished_run_is_taken_in_when_its_rows_are_lost_or_were_not_all_writt
         patch.setattr(tables, "write_file", killed)
         with pytest.raises(KeyboardInterrupt):
             study(config(tmp_path, [ONE]))
-    assert [file.name for file in (tmp_path / "tables").iterdir()] == ["tiny_training.csv"]
+    assert [file.name for file in (tmp_path / "tables").glob("*.csv")] == ["tiny_training.csv"]
     study(config(tmp_path, [ONE]))
     assert {file: file.read_bytes() for file in whole} == whole
 
@@ -213,6 +213,23 @@ def test_a_killed_run_stops_no_other_and_is_continued(tmp_path, monkeypatch):
         patch.setattr(work, "_start", Here)
         study(cfg)
     assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0, 1]
+
+
+def test_a_second_study_on_the_same_tables_is_refused_while_the_first_is_at_work(tmp_path, monkeypatch):
+    cfg, refused = config(tmp_path, [ONE]), r"out=.*name=tiny: another study is at work on these tables"
+
+    def start(run: StudyRun) -> Here:
+        with pytest.raises(ValueError, match=refused):
+            study(cfg)
+        looks = cfg.copy()
+        looks.run = False
+        study(looks)
+        return Here(run)
+
+    monkeypatch.setattr(work, "_start", start)
+    study(cfg)
+    study(cfg)
+    assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0]
 
 
 STUDY = """
