@@ -9,10 +9,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModule
 from torch import distributions as d
-from torchrl.modules import IndependentNormal
+from torchrl.modules import IndependentNormal, TanhNormal
 
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
-from torchrl_priors.priors import ActionPrior, BoltzmannPrior, UniformPrior
+from torchrl_priors.priors import ActionPrior, BoltzmannPrior, ModulePrior, UniformPrior
+from torchrl_priors.transforms import PriorLogProb
 
 STATES, ACTIONS = 6, 3
 
@@ -116,6 +117,12 @@ class TestStructuralDegradation:
             StructuralDegradation(prior, "nowhere").get_dist(visits(3))
         with pytest.raises(ValueError, match="parameters"):
             StructuralDegradation(prior, self.MASK, gaussian())
+        squashed, plain = (
+            ModulePrior(torch.nn.Linear(3, 2), "mean", std=0.1, distribution_class=kind)
+            for kind in (TanhNormal, IndependentNormal)
+        )
+        with pytest.raises(ValueError, match=r"IndependentNormal would be read as the prior's TanhNormal"):
+            StructuralDegradation(squashed, "bad", plain)
 
 
 class TestRandomDegradation:
@@ -198,6 +205,12 @@ class TestRandomDegradation:
         batch = visits(50)
         mixed.draw(batch)
         assert_advice(mixed, prior, prior.adversary(), batch, ~batch["prior", "degraded"].squeeze(-1))
+
+    def test_draws_for_steps_without_a_next_observation(self, prior: BoltzmannPrior) -> None:
+        flags = {name: torch.zeros(9, 1, dtype=torch.bool) for name in ("done", "terminated")}
+        batch = visits(9).update({"action": torch.zeros(9, dtype=torch.int64), "next": TensorDict(flags, [9])})
+        out = PriorLogProb(RandomDegradation(prior, 0.5), boundary="zero", time_dim=0)(batch)
+        assert torch.equal(out["next", "prior", "degraded"][:-1], out["prior", "degraded"][1:])
 
     def test_bad_settings_are_refused(self, prior: BoltzmannPrior) -> None:
         for p in (-0.1, 1.1, float("nan")):

@@ -16,7 +16,7 @@ from torchrl.modules import (
     TruncatedNormal,
 )
 
-from torchrl_priors.distributions import cross_entropy, kl_divergence
+from torchrl_priors.distributions import cross_entropy, cross_entropy_and_kl, kl_divergence
 
 BATCH, ACTIONS = 4, 3
 
@@ -190,3 +190,16 @@ def test_a_cross_entropy_of_no_samples_is_refused():
     dist = d.Categorical(torch.ones(2))
     with pytest.raises(ValueError, match="num_samples"):
         cross_entropy(dist, dist, num_samples=0)
+
+
+def test_the_divergence_of_a_mixture_is_the_mean_over_its_samples():
+    parts = d.Independent(d.Normal(torch.tensor([[-1.0], [1.0]]), torch.full((2, 1), 0.3)), 1)
+    mixture = d.MixtureSameFamily(d.Categorical(torch.tensor([0.4, 0.6])), parts)
+    prior = IndependentNormal(torch.zeros(1), torch.ones(1))
+    torch.manual_seed(0)
+    exact, kl = cross_entropy_and_kl(mixture, prior, num_samples=20_000)
+    points = torch.linspace(-5, 5, 20_001).unsqueeze(-1)
+    density = mixture.log_prob(points).exp()
+    expected = (density * (density.log() - prior.log_prob(points))).sum() * (points[1] - points[0])
+    torch.testing.assert_close(kl, expected.squeeze(), atol=0.02, rtol=0)
+    assert exact > kl

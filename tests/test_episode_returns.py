@@ -78,6 +78,8 @@ def test_bad_input_of_a_plateau_is_named() -> None:
     plateau = Plateau(window=10)
     with pytest.raises(KeyError, match="RewardSum"):
         plateau.update(TensorDict(batch_size=[3]))
+    with pytest.raises(ValueError, match="window=10 is less than the 20 frames of a batch"):
+        plateau.update(TensorDict(batch_size=[4, 5]))
     with pytest.raises(ValueError, match="not finite"):
         plateau.update(batch(torch.tensor([float("nan")])))
 

@@ -153,8 +153,19 @@ def test_a_student_within_the_teachers_support_learns(student: str, teacher: str
     assert AE2RLoss(policy(student), ActionPrior(policy(teacher)), method="kickstart")(batch())["loss_prior"].isfinite()
 
 
+@pytest.mark.parametrize(("student", "teacher"), [("normal", "tanh"), ("wide_tanh", "tanh"), ("normal", "beta")])
+def test_a_student_beyond_the_teachers_support_can_be_pulled_to_it(student: str, teacher: str) -> None:
+    loss = AE2RLoss(policy(student), ActionPrior(policy(teacher)), method="pull", num_samples=4)
+    out = loss(batch())
+    out["loss_prior"].backward()
+    assert out["loss_prior"].isfinite()
+    assert out["prior_kl"] == torch.inf
+    assert all(p.grad.isfinite().all() for p in loss.actor_network_params.values(True, True))
+
+
 def test_a_teacher_that_leaves_the_students_bounds_is_no_target() -> None:
-    with pytest.raises(ValueError, match=r"the prior's IndependentNormal and the student's TanhNormal"):
+    words = r"the prior's IndependentNormal and the student's TanhNormal.*: squash the prior .*, or make the student a"
+    with pytest.raises(ValueError, match=words):
         AE2RLoss(policy("tanh"), ActionPrior(policy("normal")), method="pull")(batch())
 
 

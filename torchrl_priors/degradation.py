@@ -12,6 +12,8 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
+from torch import distributions as d
+from torchrl.modules import IndependentNormal
 
 from torchrl_priors.keys import read
 from torchrl_priors.priors.prior import NegatedPrior, Prior, PriorWrapper
@@ -29,7 +31,7 @@ class Degradation(PriorWrapper):
             ``None``: the negated advice, see :meth:`Prior.adversary`.
 
     Raises:
-        ValueError: the adversary's distribution has other parameters than the prior's.
+        ValueError: the adversary's distribution has other parameters than the prior's, or is of another kind.
         NotImplementedError: no adversary is given, and the prior has none.
     """
 
@@ -41,6 +43,10 @@ class Degradation(PriorWrapper):
                 f"An adversary must have the parameters of the prior that it replaces, got {adversary.param_names} and"
                 f" {self.param_names}."
             )
+        kinds = adversary.distribution_class, self.distribution_class
+        if "loc" in self.param_names and {*kinds} - {d.Normal, IndependentNormal} and kinds[0] != kinds[1]:
+            ours, theirs = (getattr(kind, "__name__", kind) for kind in kinds)
+            raise ValueError(f"The adversary's {ours} would be read as the prior's {theirs}: give both the same.")
         self.bad_advice = adversary
         self._read_too(adversary.in_keys)
 
@@ -211,8 +217,8 @@ class RandomDegradation(Degradation):
         if mask is None:
             shape = (*tensordict.batch_size, 1)
             device = tensordict.device
-            if device is None and self.in_keys:
-                device = tensordict.get(self.in_keys[0]).device
+            if device is None:  # of a batch without next observations, the device of what there is
+                device = next((value.device for value in tensordict.values(True, True)), None)
             mask = (torch.rand(shape, generator=self.generator, device="cpu") < self.p).to(device)
             tensordict.set(self.draw_key, mask)
         _check_bool(mask)

@@ -22,6 +22,7 @@ __all__ = [
     "BoxUniform",
     "action_shape",
     "bounds_of",
+    "covers",
     "cross_entropy",
     "cross_entropy_and_kl",
     "cross_entropy_of_advice",
@@ -225,7 +226,11 @@ def _divergence(
         return exact - dist.entropy()
     if has_analytic_kl(dist, prior_dist):
         return _kl(dist, prior_dist)
-    action, log_prob = _sample(dist, num_samples)
+    if dist.has_rsample or torch.is_grad_enabled():
+        action, log_prob = _sample(dist, num_samples)
+    else:
+        action = dist.sample(torch.Size([1 if num_samples is None else num_samples]))
+        log_prob = dist.log_prob(action)
     return (log_prob - prior_dist.log_prob(action)).mean(0)
 
 
@@ -281,17 +286,23 @@ def _check(
     bounds, prior_bounds = bounds_of(dist), bounds_of(prior_dist)
     if (bounds is None) != (prior_bounds is None):
         raise ValueError(f"Expected distributions over the same actions, got {pair}: only one of them is discrete.")
-    if bounds is None or prior_bounds is None or isinstance(prior_dist, BoxUniform):
-        return
-    if outside(*bounds, prior_bounds):
+    if bounds is not None and prior_bounds is not None and not covers(prior_dist, dist):
         ours, theirs = (
             f"[{torch.as_tensor(x).min():.4g}, {torch.as_tensor(y).max():.4g}]" for x, y in (bounds, prior_bounds)
         )
         raise ValueError(
             f"Of {pair}, the second has no finite opinion on all actions of the first: they are in {ours}, its own in"
-            f" {theirs}. Give both the same bounds: squash the student (TanhNormal), or make the prior a Gaussian, as"
-            " std=... does in load_sb3_prior."
+            f" {theirs}. Give both the same bounds: squash the {whose[0]} (TanhNormal), or make the {whose[1]} a"
+            f" Gaussian{', as std=... does in load_sb3_prior' if whose[1] == 'prior' else ''}."
         )
+
+
+def covers(prior_dist: d.Distribution, dist: d.Distribution) -> bool:
+    """Whether a prior has a finite opinion on all that a student may do, as to bounds; compiled code can't tell."""
+    if is_compiling() or isinstance(prior_dist, BoxUniform):
+        return True
+    bounds, prior_bounds = bounds_of(dist), bounds_of(prior_dist)
+    return bounds is None or prior_bounds is None or not outside(*bounds, prior_bounds)
 
 
 def outside(low: Any, high: Any, bounds: tuple[Any, Any]) -> bool:

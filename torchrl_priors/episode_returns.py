@@ -73,7 +73,7 @@ class Plateau(EpisodeReturns):
     :math:`R - R' > \max(e,\, 0.1\,|R'|)`. Nothing is said before there are two windows with ``min_episodes`` each.
 
     Keyword Args:
-        window (int): frames.
+        window (int): frames, at least those of a batch, as episodes count as ended at the end of their batch.
         min_episodes (int): in each window. Defaults to 6.
         gain (float): share of :math:`R'` that counts as a gain. Defaults to 0.1.
         return_key, done_key (NestedKey): see :class:`~torchrl_priors.TeacherTrial`.
@@ -117,7 +117,13 @@ class Plateau(EpisodeReturns):
         super().__init__(return_key=return_key, done_key=done_key)
 
     def update(self, batch: TensorDictBase) -> None:
-        """Read a batch, and forget what no window holds any more; see :meth:`EpisodeReturns.update`."""
+        """Read a batch, and forget what no window holds any more; see :meth:`EpisodeReturns.update`.
+
+        Raises:
+            ValueError: the batch has more frames than the window.
+        """
+        if batch.numel() > self.window:
+            raise ValueError(f"window={self.window} is less than the {batch.numel()} frames of a batch: raise it.")
         super().update(batch)
         self.forget(2 * self.window)
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import unravel_key
+from tensordict.utils import expand_as_right, unravel_key
 from torch import Tensor, nn
 from torch import distributions as d
 from torch.compiler import is_compiling
@@ -42,22 +42,49 @@ def read(tensordict: TensorDictBase, key: NestedKey, hint: str) -> Tensor:
     return value
 
 
-def next_step(tensordict: TensorDictBase, keys: Iterable[NestedKey], terminated: Tensor) -> TensorDict:
+def next_step(
+    tensordict: TensorDictBase, keys: Iterable[NestedKey], terminated: Tensor, done: Tensor | None = None
+) -> TensorDict:
     """What the next step holds under ``keys``, dense, and this step's entries where there is no next observation.
 
     Environments that reset themselves, and TorchRL's ``NextStateReconstructor``, leave NaN there at
-    any end of a trajectory. This step's entry takes its place, as in TorchRL's ``GAE``;
-    it always does after a termination, where nothing is made of the next state. Entries that are computed at the next
-    step may be there alone.
+    any end of a trajectory, and ``AutoResetTransform`` -1 or, of types without a sign, 0. This step's entry takes its
+    place, as in TorchRL's ``GAE``; it always does after a termination, where nothing is made of the next state. Entries
+    that are computed at the next step may be there alone.
     """
+    done = tensordict.get(under_next("done"), None) if done is None else done
+    done = terminated if done is None or done.shape != terminated.shape else done
+    dims = terminated.ndim - 1  # of the batch
     out = TensorDict({}, tensordict.batch_size, device=tensordict.device)
     for key in keys:
         value = read(tensordict, under_next(key), NO_NEXT)
         here = tensordict.get(key, None)
         if here is None or here.shape != value.shape:
             here = torch.zeros_like(value)
-        mask = terminated.reshape(*terminated.shape[:-1], *[1] * (value.ndim - terminated.ndim + 1))
-        out.set(key, torch.where(mask | value.isnan(), here, value))
+        shape = (*terminated.shape[:-1], *[1] * (value.ndim - dims))
+        if value.is_floating_point():
+            absent = value.isnan()
+        else:
+            absent = value == (-1 if value.dtype.is_signed else 0)
+            absent = absent.flatten(dims).all(-1) if value.ndim > dims else absent
+            absent = absent.reshape(shape) & done.reshape(shape)
+        out.set(key, torch.where(terminated.reshape(shape) | absent, here, value))
+    return out
+
+
+def without_padding(tensordict: TensorDictBase, keys: Iterable[NestedKey], mask: Tensor) -> TensorDictBase:
+    """A batch ``[*B]`` with the entries of its first valid step where ``mask`` is false: they can be scored.
+
+    What is computed there is dropped later. Left as they are, the zeros or NaN of padding may be out of bounds, or
+    spoil gradients though their loss is not used.
+    """
+    first = mask.reshape(-1).int().argmax().reshape(1)
+    out = tensordict.copy()
+    for key in keys:
+        value = tensordict.get(key, None)
+        if value is not None:
+            fill = value.flatten(0, mask.ndim - 1).index_select(0, first).squeeze(0)
+            out.set(key, torch.where(expand_as_right(mask, value), value, fill))
     return out
 
 

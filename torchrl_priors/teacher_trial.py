@@ -61,11 +61,12 @@ class TeacherTrial:
         max_frames (int): of each arm.
         in_doubt (str): who wins in doubt, ``"first"`` or ``"best"``: the first arm, or always the one with the highest
             recent return. Defaults to ``"first"``.
-        alpha (float): probability of dropping an arm though it is no worse. Defaults to 0.05.
+        alpha (float): probability of dropping an arm though it is no worse, as far as means of returns are normal: it
+            is larger with few episodes. Defaults to 0.05.
         min_frames (int, optional): of each arm before the first decision. Learning curves cross, and a test can't see
             that: on Hopper the student of a bad teacher leads at 4096 frames and is clearly behind at 24576. Defaults
             to half of ``max_frames``.
-        recent (float): the share of an arm's frames in which recent episodes ended. Defaults to 0.25.
+        recent (float): the share of an arm's frames in which recent episodes ended, in whole batches. Defaults to 0.25.
         min_episodes (int): recent episodes of each arm before a decision. Defaults to 8.
         return_key (NestedKey): undiscounted return so far, ``[*B, 1]``, as
             :class:`~torchrl.envs.RewardSum` writes it. Defaults to ``("next", "episode_reward")``.

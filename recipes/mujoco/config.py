@@ -284,5 +284,7 @@ def _check_trial(cfg: MujocoConfig) -> None:
     most = trial.max_frames
     require(most >= batch, "trial.max_frames", most, f"at least one rollout of {batch}")
     require(0 <= trial.min_frames <= most, "trial.min_frames", trial.min_frames, f"a number from 0 to {most}")
+    window, expected = cfg.let_go.window, f"at least one rollout of {batch}"
+    require(cfg.let_go.methods == "none" or window >= batch, "let_go.window", window, expected)
     require(0 < trial.alpha < 1, "trial.alpha", trial.alpha, "a number between 0 and 1")
     require(0 < trial.recent <= 1, "trial.recent", trial.recent, "a share above 0 and up to 1")

@@ -13,7 +13,18 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import NextStateReconstructor
 from torchrl.objectives.value import GAE
 
-from torchrl_priors import ActionPrior, AE2RLoss, ClipPPOPriorLoss, RandomDegradation, prior_transforms
+from torchrl_priors import (
+    ActionPrior,
+    AE2RLoss,
+    BoltzmannPrior,
+    ClipPPOPriorLoss,
+    PriorBonus,
+    PriorLogProb,
+    PriorWeight,
+    RandomDegradation,
+    prior_transforms,
+)
+from torchrl_priors.keys import next_step
 from torchrl_priors.methods import METHODS
 
 ENVS, LIMIT, STEPS = 4, 5, 12
@@ -107,3 +118,45 @@ def test_this_step_takes_the_place_of_a_missing_next_one_as_in_gae(method: str) 
         assert torch.equal(results[0]["next", key], results[1]["next", key])
     first, second = (loss(batch) for batch in results)
     assert same_tensors(dict(first), dict(second))
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8])
+@pytest.mark.parametrize("size", [None, 2])
+def test_what_takes_the_place_of_integers_is_not_read(dtype: torch.dtype, size: int | None) -> None:
+    """TorchRL fills with -1, and with 0 where there is no sign; elsewhere these are values as others are."""
+    fill = -1 if dtype.is_signed else 0
+    shape = (3,) if size is None else (3, size)
+    here, after = torch.full(shape, 5, dtype=dtype), torch.full(shape, fill, dtype=dtype)
+    done = torch.tensor([[True], [False], [True]])
+    if size is not None:
+        after[2, 0] = 7  # an observation
+    following = TensorDict(state=after, done=done, terminated=torch.zeros_like(done), batch_size=[3])
+    found = next_step(TensorDict(state=here, next=following, batch_size=[3]), ["state"], following["terminated"])
+    expected = after.clone()
+    expected[[0] if size is not None else [0, 2]] = 5
+    assert torch.equal(found["state"], expected)
+
+
+def test_integers_of_an_environment_that_resets_itself_are_advised_on() -> None:
+    class Numbered(ResetsItself):
+        def __init__(self, **kwargs: Any) -> None:
+            super().__init__(**kwargs)
+            self.observation_spec = Composite(state=Categorical(5, shape=(ENVS,)), shape=(ENVS,))
+
+        def _reset(self, tensordict: TensorDictBase | None, **kwargs: Any) -> TensorDictBase:
+            return self.numbered(super()._reset(tensordict, **kwargs))
+
+        def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+            return self.numbered(super()._step(tensordict))
+
+        def numbered(self, tensordict: TensorDictBase) -> TensorDictBase:
+            return tensordict.exclude("observation").set("state", torch.randint(5, (ENVS,)))
+
+    batch = Numbered(auto_reset=True, auto_reset_replace=True).rollout(
+        STEPS, BoltzmannPrior(torch.randn(5, 2)).policy(), break_when_any_done=False
+    )
+    ended = batch["next", "done"].squeeze(-1)
+    assert (batch["next", "state"][ended] == -1).all()
+    prior, weight = BoltzmannPrior(torch.randn(5, 2)), PriorWeight.table(5)
+    batch = PriorBonus(weight)(PriorLogProb(prior, boundary="zero")(batch))
+    assert batch["next", "prior_bonus"].isfinite().all()

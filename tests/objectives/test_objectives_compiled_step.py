@@ -12,7 +12,7 @@ from torch import nn
 from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss
 
-from torchrl_priors import ActionPrior, PriorWeight
+from torchrl_priors import ActionPrior, AE2RLoss, CallablePrior, PriorWeight
 from torchrl_priors.objectives import AVECMixin, ClipPPOPriorLoss, CompiledStep, ValueOffset
 
 
@@ -215,6 +215,48 @@ def test_sequences_are_taken_whole(method):
     reports, expected = step(batch, indices), plain_steps(*plain, batch, indices)
     for report, losses in zip(reports, expected, strict=True):
         torch.testing.assert_close(report, torch.stack(list(losses.values())), atol=1e-5, rtol=1e-4)
+
+
+def test_other_settings_of_adam_and_of_clipping_are_seen():
+    batch, indices = make_data()
+    (loss, optimizer, step), (other, other_optimizer) = both("kickstart")
+    step(batch, indices[:3])
+    plain_steps(other, other_optimizer, batch, indices[:3])
+    for opt in (optimizer, other_optimizer):
+        opt.param_groups[0].update(betas=(0.5, 0.9), eps=1e-3)
+    step.max_grad_norm = 0.05
+    step(batch, indices[3:])
+    plain_steps(other, other_optimizer, batch, indices[3:], max_grad_norm=0.05)
+    for parameter, expected in zip(loss.actor_network.parameters(), other.actor_network.parameters(), strict=True):
+        torch.testing.assert_close(parameter, expected, atol=2e-6, rtol=1e-4)
+
+
+def test_names_are_those_of_the_batch_at_hand():
+    batch, indices = make_data()
+    (_, _, step), _ = both("e2r")
+    without = batch.exclude(("next", "prior_bonus"))
+    names = []
+    for data in (batch, without, batch):
+        assert step(data, indices[:1]).shape[-1] == len(step.names)
+        names.append("prior_bonus" in step.names)
+    assert names == [True, False, True]
+
+
+def test_a_prior_that_runs_python_on_the_values_is_refused_and_its_advice_in_the_batch_is_not():
+    batch, indices = make_data()
+    actor, critic = make_actor("normal"), make_critic()
+    bot = CallablePrior(lambda observation: observation[:2], std=0.4)
+
+    def step_of(**kwargs):
+        loss = ClipPPOPriorLoss(actor, critic, AE2RLoss(actor, bot, method="kickstart", functional=False, **kwargs))
+        return CompiledStep(loss, torch.optim.Adam(loss.parameters(), lr=0.0), backend="eager"), loss
+
+    with pytest.raises(RuntimeError, match=r"Tensor\.numpy.*prior_in_batch=True"):
+        step_of()[0](batch, indices)
+    step, loss = step_of(prior_in_batch=True)
+    reports = step(bot(batch), indices[:3])
+    expected = [loss(batch[index])["prior_cross_entropy"] for index in indices[:3]]
+    torch.testing.assert_close(reports[:, step.names.index("prior_cross_entropy")], torch.stack(expected))
 
 
 def test_what_it_can_not_do_is_refused():

@@ -18,6 +18,7 @@ from torchrl.objectives.value import GAE
 from torchrl_priors import (
     ActionPrior,
     AE2RLoss,
+    ClipPPOPriorLoss,
     MultiTeacherLoss,
     PriorBonus,
     PriorLogProb,
@@ -105,6 +106,37 @@ def test_an_advantage_on_raw_rewards_is_warned_of(method: str) -> None:
     loss = make_loss(method)
     with pytest.warns(UserWarning, match=r"set_keys\(reward='shaped_reward'\)"):
         loss(shaped(loss, reward_key="reward"))
+
+
+@pytest.mark.parametrize("bonus_coeff", [0.0, 1e-7])
+def test_a_bonus_that_does_not_show_tells_nothing_about_the_advantage(bonus_coeff: float) -> None:
+    loss = make_loss("e2r")
+    loss.bonus_coeff = bonus_coeff
+    for reward_key in ("shaped_reward", "reward"):
+        with silence():
+            loss(shaped(loss, reward_key=reward_key))
+    loss.bonus_coeff = 1.0
+    with pytest.warns(UserWarning, match=r"set_keys\(reward='shaped_reward'\)"):
+        loss(shaped(loss, reward_key="reward"))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_rewards_under_keys_of_ones_own_are_never_overwritten(method: str) -> None:
+    batch = rollout(2)
+    batch["next", "scaled"] = 0.01 * batch["next", "reward"]
+    for owner, key in (("loss", "scaled"), ("prior_loss", "scaled")):
+        prior_loss = make_loss(method)
+        loss = ClipPPOPriorLoss(prior_loss.actor_network, make_critic(), prior_loss)
+        bonus = METHODS[method].bonus != "none"
+        if owner == "prior_loss":
+            prior_loss.set_keys(reward=key)
+        elif not bonus:  # with one, the key is where the shaped reward goes
+            loss.set_keys(reward=key)
+        after = prior_transforms(loss)(batch.clone())["next"]
+        assert torch.equal(after["reward"], batch["next", "reward"])
+        assert torch.equal(after["scaled"], batch["next", "scaled"])
+        raw = batch["next", key if owner == "prior_loss" else "reward"]
+        assert torch.equal(after["shaped_reward"], raw) is not bonus
 
 
 @pytest.mark.parametrize("shape", [(), (3,)])

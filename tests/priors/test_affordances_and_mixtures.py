@@ -98,6 +98,16 @@ class TestMixturePrior:
         assert torch.equal(negated["loc"], -params["loc"])
         assert torch.equal(negated["mixture_logits"], params["mixture_logits"])
 
+    def test_a_gaussian_mixture_acts_as_its_heaviest_prior_does(self) -> None:
+        priors = [ModulePrior(nn.Linear(OBS, ACTIONS), "mean", std=0.1) for _ in range(2)]
+        weights = TensorDictModule(
+            lambda x: torch.stack([x[..., 0].exp(), (-x[..., 0]).exp()], -1), ["observation"], ["w"]
+        )
+        batch = observations(2, 6)
+        means = [prior(batch.copy())["prior", "loc"] for prior in priors]
+        expected = torch.where(batch["observation"][..., :1] > 0, *means)
+        torch.testing.assert_close(MixturePrior(priors, weights).policy()(batch)["action"], expected)
+
     def test_one_hot_and_nested_mixtures(self) -> None:
         one_hot = [BoltzmannPrior(table(seed), distribution_class=OneHotCategorical) for seed in (0, 1, 2)]
         nested = MixturePrior([MixturePrior(one_hot[:2]), one_hot[2]], [2.0, 1.0])

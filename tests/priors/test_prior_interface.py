@@ -133,6 +133,19 @@ def test_a_prior_of_ones_own_goes_wherever_a_prior_goes() -> None:
     assert (StructuralDegradation(mine, lambda td: td["state"] >= 0).get_dist(batch).probs.argmin(-1) == 1).all()
 
 
+def test_parameters_are_written_by_their_names() -> None:
+    class Backwards(Always):
+        def __init__(self) -> None:
+            Prior.__init__(self, ["state"], ["loc", "scale"], d.Normal)
+
+        def get_params(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+            return {"scale": torch.full(tensordict.batch_size, 2.0), "loc": torch.zeros(tensordict.batch_size)}
+
+    batch = Backwards()(states())
+    assert (batch["prior", "loc"] == 0).all()
+    assert (batch["prior", "scale"] == 2).all()
+
+
 def test_an_interface_is_no_prior() -> None:
     with pytest.raises(TypeError, match="abstract"):
         Prior(["state"], ["logits"], d.Categorical)

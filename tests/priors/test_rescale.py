@@ -91,3 +91,8 @@ def test_what_cannot_be_rescaled_is_refused() -> None:
     for low, high in ((1.0, -1.0), (-np.inf, 1.0), (0.0, 0.0)):
         with pytest.raises(ValueError, match="finite, the lower ones below the upper ones"):
             RescaledPrior(squashed(), low, high)
+
+
+def test_the_adversary_of_a_prior_that_was_moved_is_where_it_is() -> None:
+    prior = RescaledPrior(squashed(), LOW, HIGH).to("meta")
+    assert prior.adversary().factor.device == prior.factor.device

@@ -211,6 +211,7 @@ def test_a_trial_is_no_run_with_a_weight_to_show(trial, tmp_path):
         ("total_frames=192", "total_frames=192: expected at least 256, for a trial of 2 students"),
         ("let_go.methods=some", "let_go.methods=some"),
         ("let_go.window=0", "let_go.window=0"),
+        ("let_go.window=32", "let_go.window=32: expected at least one rollout of 64"),
         ("let_go.fall=0", "let_go.fall=0"),
     ],
 )

@@ -34,6 +34,7 @@ from trajectories import (
 
 from torchrl_priors.degradation import RandomDegradation, StructuralDegradation
 from torchrl_priors.functional import categorical_cross_entropy, gaussian_cross_entropy
+from torchrl_priors.objectives import AE2RLoss
 from torchrl_priors.prior_weight import PriorWeight
 from torchrl_priors.priors import ActionPrior, BoltzmannPrior
 from torchrl_priors.transforms import PriorBonus, PriorLogProb
@@ -135,6 +136,34 @@ class TestShift:
         torch.testing.assert_close(
             padded["next", "prior_log_prob"][1], transform(batch.clone())["next", "prior_log_prob"][1]
         )
+
+    @pytest.mark.filterwarnings("ignore:No step of the batch goes on")  # for they are not
+    @pytest.mark.parametrize("fill", [0.0, torch.nan])
+    def test_padding_need_not_be_valid(self, fill: float) -> None:
+        def bounded() -> ProbabilisticActor:
+            net = nn.Sequential(nn.Linear(2, 2), NormalParamExtractor())
+            module = Mod(net, in_keys=["observation"], out_keys=["loc", "scale"])
+            options = {"distribution_class": TanhNormal, "distribution_kwargs": {"low": 1.0, "high": 2.0}}
+            return ProbabilisticActor(module, in_keys=["loc", "scale"], **options)
+
+        student, teacher = bounded(), bounded()
+        batch = trajectories(2, 4, ends=0.0)
+        batch["action"] = 1.1 + 0.8 * torch.rand(2, 4, 1)
+        batch["observation"], batch["next", "observation"] = torch.randn(2, 2, 4, 2)
+        padded, mask = batch.clone(), torch.tensor([[True] * 4, [True] * 2 + [False] * 2])
+        for key in ("action", "observation", ("next", "observation")):
+            padded[key][~mask] = fill
+        padded["collector", "mask"] = mask
+        transform = PriorLogProb(ActionPrior(teacher), student, time_dim=1, keep_params=True)
+        torch.manual_seed(0)
+        out = transform(padded)
+        for key in ("prior_log_prob", ("next", "prior_log_prob")):
+            assert (out[key][~mask] == 0).all()
+            assert out[key].isfinite().all()
+        torch.testing.assert_close(out["prior_log_prob"][1, :2], transform(batch[:, :2])["prior_log_prob"][1])
+        loss = AE2RLoss(student, ActionPrior(teacher), method="kickstart", num_samples=2)
+        loss(out)["loss_prior"].backward()
+        assert all(p.grad.isfinite().all() for p in loss.actor_network_params.values(True, True))
 
     @pytest.mark.filterwarnings("ignore:No step of the batch goes on")  # for they are not
     def test_unused_next_states_need_not_be_valid(self) -> None:

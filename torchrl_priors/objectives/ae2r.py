@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
@@ -13,11 +14,11 @@ from tensordict.nn import (
     TensorDictParams,
     dispatch,
 )
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, expand_as_right
 from torch import distributions as d
 from torch.compiler import is_compiling
 
-from torchrl_priors.keys import check_option, out_key, under_next, warn_of_another_teacher
+from torchrl_priors.keys import check_option, out_key, under_next, warn_of_another_teacher, without_padding
 from torchrl_priors.methods import MethodSpec, get_method
 from torchrl_priors.priors import Prior
 
@@ -280,6 +281,14 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
         """See :meth:`forward`; ``dist`` is the student's distribution, if it is at hand."""
         if not is_compiling():
             self.wiring.look(self, tensordict)
+        masks = [tensordict.get(key, None) for key in self._loss_mask_keys()]
+        masks = [mask for mask in masks if mask is not None]
+        steps = tensordict if masks else None
+        if masks and tensordict.ndim:
+            valid = torch.ones(tensordict.batch_size, dtype=torch.bool, device=masks[0].device)
+            for mask in masks:  # with or without a trailing 1
+                valid = valid & expand_as_right(mask.reshape(mask.shape[: valid.ndim]), valid)
+            tensordict, dist = without_padding(tensordict, self.in_keys, valid), None
         found: Found = {}
         for term in self.terms:
             term(tensordict, found, dist)
@@ -289,8 +298,6 @@ class AE2RLoss(SelectedOutput, NetworksLoss):
         if bonus is not None:
             found["prior_bonus"] = bonus
 
-        masked = any(tensordict.get(key, None) is not None for key in self._loss_mask_keys())
-        steps = tensordict if masked else None
         out = TensorDict()
         for name, coeff in _LOSSES.items():
             if name in found:

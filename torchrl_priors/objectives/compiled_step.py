@@ -33,7 +33,9 @@ class CompiledStep:
     optimizer are those of the ordinary objects, which can be saved, loaded, scheduled and used without it at any time.
 
     What is recorded is one path through the code: a decision that the loss takes in Python by looking at data (such as
-    the checks of arguments in ``torch.distributions``) is taken once. Look at the reported values to find NaNs.
+    the checks of arguments in ``torch.distributions``) is taken once. Look at the reported values to find NaNs. A prior
+    that runs Python on the values, as :class:`~torchrl_priors.CallablePrior` does, is refused: make the loss with
+    ``prior_in_batch=True``.
 
     Args:
         loss (LossModule): of scalar losses, with ``functional=False`` where it has the choice.
@@ -50,6 +52,7 @@ class CompiledStep:
     Raises:
         TypeError: the optimizer is no Adam.
         ValueError: one of Adam's variants, or a functional loss.
+        RuntimeError: at call, a loss that hands values of tensors to Python.
 
     Examples:
         >>> import torch
@@ -102,7 +105,7 @@ class CompiledStep:
         self._select = select if select is not None else lambda name: name.startswith("loss_")
         self._backend = backend
         self._rest: tuple[int, ...] = ()  # of the batch, behind the dimension that is indexed
-        self._graphs: dict[Hashable, Callable[[list[Tensor]], Tensor]] = {}
+        self._graphs: dict[Hashable, tuple[Callable[[list[Tensor]], Tensor], list[str]]] = {}
         self._reached: dict[Hashable, list[list[Tensor]]] = {}
 
     @torch.no_grad()
@@ -128,13 +131,15 @@ class CompiledStep:
                 others = [tensor for tensor in tensors_of(self.loss) if id(tensor) not in trained]
                 state = [tensor for flat in flats for tensor in flat.buffers]
                 constants = [*(tensor.detach() for tensor in others), *values]
-                layout = (self._rest, keys, *(flat.layout for flat in flats), *map(layout_of, constants))
+                settings = (self.max_grad_norm, *((g["betas"], g["eps"]) for g in self.optimizer.param_groups))
+                layout = (self._rest, keys, settings, *(flat.layout for flat in flats), *map(layout_of, constants))
             which = (layout, layout_of(index))
             factors = torch.tensor([flat.factors(len(reports) + 1) for flat in flats], device=index.device)
             inputs = [*state, factors, *constants, index]
             if which not in self._graphs:
                 self._graphs[which] = self._record(keys, flats, others, inputs)
-            reports.append(self._graphs[which](inputs))
+            graph, self.names = self._graphs[which]
+            reports.append(graph(inputs))
         for flat in flats:
             flat.write(len(reports))
         return torch.stack(reports)
@@ -183,10 +188,11 @@ class CompiledStep:
 
     def _record(
         self, keys: tuple[NestedKey, ...], flats: list[FlatParameters], others: list[Tensor], inputs: list[Tensor]
-    ) -> Callable[[list[Tensor]], Tensor]:
-        """Takes a step on copies, and compiles what happened."""
+    ) -> tuple[Callable[[list[Tensor]], Tensor], list[str]]:
+        """Takes a step on copies, and compiles what happened; the graph, and the names of what it reports."""
         groups = self.optimizer.param_groups
         trained = [parameter for flat in flats for parameter in flat.parameters]
+        names: list[str] = []
 
         def step(*tensors: Tensor) -> Tensor:
             rest = iter(tensors)
@@ -199,7 +205,7 @@ class CompiledStep:
             leaves = [piece.detach().requires_grad_() for piece in pieces]
             with replaced(self.loss, [*trained, *others], [*leaves, *copies]):
                 losses, gradients = self._differentiate(keys, values, index, leaves)
-            self.names = list(losses)
+            names[:] = losses
 
             found = iter(gradients)
             joined = [flat.join(list(islice(found, len(flat.parameters)))) for flat in flats]
@@ -211,4 +217,4 @@ class CompiledStep:
                     adam(parameter, mean, square, gradient, factors[i], group["betas"], group["eps"])
             return torch.stack([value.detach().mean() for value in losses.values()])
 
-        return record(step, inputs, self._backend)
+        return record(step, inputs, self._backend), names

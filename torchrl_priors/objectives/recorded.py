@@ -87,6 +87,9 @@ _TANH_ABOVE = (
 )
 _TANH_BELOW = (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)
 
+#: What hands the values of a tensor to Python.
+_LEAVING = (Tensor.numpy, Tensor.__array__, Tensor.tolist)
+
 _FASTER: dict[OpOverload, Callable[..., Any]] = {
     torch.ops.aten.tanh.default: _tanh,
     torch.ops.aten.addmm.default: _addmm,
@@ -120,10 +123,19 @@ def replaced(module: nn.Module, old: list[Tensor], new: list[Tensor]) -> Iterato
 
 
 class _Decided(TorchFunctionMode):
-    """While operations are recorded, decisions that depend on data are taken by the data at hand."""
+    """While operations are recorded, decisions that depend on data are taken by the data at hand.
+
+    Values that leave torch are refused: what is made of them would be the same for every later minibatch.
+    """
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func is Tensor.__bool__:
             with disable_proxy_modes_tracing():
                 return func(*args)
+        if func in _LEAVING:
+            raise RuntimeError(
+                f"A compiled step can't record Tensor.{func.__name__}: what Python makes of the values would be that of"
+                " the first minibatch in all others. If it is the prior that needs them, as a CallablePrior does, make"
+                " the loss with prior_in_batch=True, and let prior_transforms(loss) run the prior."
+            )
         return func(*args, **(kwargs or {}))

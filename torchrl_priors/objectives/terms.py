@@ -12,7 +12,7 @@ from torch import Tensor
 from torch import distributions as d
 from torchrl.objectives.utils import distance_loss
 
-from torchrl_priors.distributions import cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
+from torchrl_priors.distributions import covers, cross_entropy_and_kl, cross_entropy_of_advice, kl_divergence
 from torchrl_priors.functional import alignment, joint, prior_bonus, prior_weight_loss, td_residual
 from torchrl_priors.keys import check_advice, next_step, read, under_next
 
@@ -60,6 +60,7 @@ class AuxiliaryTerm(Term):
 
     def __init__(self, loss: AE2RLoss) -> None:
         super().__init__(loss)
+        self.aligned = loss.spec.adaptive and loss.weight_target == "advantage"
         if loss.kl_share is not None and loss.spec.cross_entropy == "teacher":
             raise ValueError("kl_share is for a cross-entropy of the student's actions: this method has the teacher's.")
 
@@ -84,14 +85,19 @@ class AuxiliaryTerm(Term):
         with contextlib.nullcontext() if loss.spec.auxiliary else torch.no_grad():
             if dist is None:
                 dist = self._student_dist(tensordict)
-            entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=samples)
-            pull = entropy
-            if loss.spec.cross_entropy == "teacher":
+            of_advice = loss.spec.cross_entropy == "teacher"
+            if of_advice and not self.aligned and not covers(prior_dist, dist):
                 pull = cross_entropy_of_advice(prior_dist, dist, num_samples=samples)
-            elif loss.kl_share is not None:
-                divergence = kl_divergence(dist, prior_dist, num_samples=samples)
-                pull = torch.lerp(entropy, divergence, loss.kl_share)
-        used = pull + entropy if loss.spec.adaptive and loss.weight_target == "advantage" else pull
+                entropy = kl = torch.full_like(pull.detach(), torch.inf)  # they are only logged
+            else:
+                entropy, kl = cross_entropy_and_kl(dist, prior_dist, num_samples=samples)
+                pull = entropy
+                if of_advice:
+                    pull = cross_entropy_of_advice(prior_dist, dist, num_samples=samples)
+                elif loss.kl_share is not None:
+                    divergence = kl_divergence(dist, prior_dist, num_samples=samples)
+                    pull = torch.lerp(entropy, divergence, loss.kl_share)
+        used = pull + entropy if self.aligned else pull
         # a teacher that rules actions out may be pulled to, at an infinite divergence, but none is at NaN
         check_advice(torch.where(kl.isnan(), kl, used.detach()), prior_dist, dist)
         ndim = tensordict.ndim or entropy.ndim  # what dispatch makes has no batch size

@@ -128,9 +128,20 @@ class MixturePrior(Prior):
         """The mixture with the parameters of :meth:`get_params`."""
         if self.param_names == ["logits"]:
             return self.distribution_class(logits=params["logits"])
-        return d.MixtureSameFamily(
+        return GaussianMixture(
             d.Categorical(logits=params["mixture_logits"]), d.Independent(d.Normal(params["loc"], params["scale"]), 1)
         )
+
+
+class GaussianMixture(d.MixtureSameFamily):
+    """A mixture of Gaussians; a policy that does not sample takes the mean of its heaviest one."""
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The action of one of the teachers, ``[*B, A]``: the mean of all may be what none of them would do."""
+        heaviest = self.mixture_distribution.logits.argmax(-1)[..., None, None]
+        gaussians: Any = self.component_distribution
+        return gaussians.base_dist.loc.take_along_dim(heaviest, -2).squeeze(-2)
 
 
 def _family(priors: list[Prior]) -> tuple[Any, list[str]]:

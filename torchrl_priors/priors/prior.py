@@ -198,8 +198,9 @@ class Prior(TensorDictModuleBase, ABC):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the parameters of the distribution under the namespace, in ``out_keys``."""
-        for key, value in zip(self.out_keys, self.get_params(tensordict).values(), strict=True):
-            tensordict.set(key, value)
+        params = self.get_params(tensordict)
+        for key, name in zip(self.out_keys, self.param_names, strict=True):
+            tensordict.set(key, params[name])
         return tensordict
 
 

@@ -86,7 +86,8 @@ class RescaledPrior(PriorWrapper):
     def adversary(self) -> Prior:
         """The negated advice of the teacher, in the student's unit."""
         (low, high), (to_low, to_high) = self._boxes
-        return RescaledPrior(self.module.adversary(), low, high, to_low=to_low, to_high=to_high)
+        adversary = RescaledPrior(self.module.adversary(), low, high, to_low=to_low, to_high=to_high)
+        return adversary.to(self.factor.device)
 
     def _map(self, action: Any) -> Tensor:
         return self.factor * action + self.shift

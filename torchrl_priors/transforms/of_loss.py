@@ -47,7 +47,10 @@ def prior_transforms(loss: LossModule, **kwargs: Any) -> Compose:
         raise TypeError(f"Expected an AE2RLoss, a MultiTeacherLoss or a ClipPPOPriorLoss, got {type(loss).__name__}.")
     of_policy: Any = loss.tensor_keys if prior_loss is not loss else None
     reward = prior_loss.tensor_keys.reward
-    shaped_reward = "shaped_reward" if of_policy is None or of_policy.reward == reward else of_policy.reward
+    has_bonus = any(part.spec.bonus != "none" for part in prior_loss.teachers)
+    shaped_reward = of_policy.reward if of_policy is not None and has_bonus else "shaped_reward"
+    if shaped_reward == reward:  # PPO was told to leave the bonus aside, and was warned
+        shaped_reward = "shaped_reward"
     student = {} if of_policy is None else {"student_log_prob_key": of_policy.sample_log_prob}
     options = {} if of_policy is None else {"done_key": of_policy.done}
     transforms: list[Any] = []

@@ -13,7 +13,15 @@ from torch import Tensor
 
 from torchrl_priors.distributions import cross_entropy
 from torchrl_priors.functional import has_next_action, joint, shift_to_next
-from torchrl_priors.keys import check_advice, check_option, next_step, read, under_next, warn_of_another_teacher
+from torchrl_priors.keys import (
+    check_advice,
+    check_option,
+    next_step,
+    read,
+    under_next,
+    warn_of_another_teacher,
+    without_padding,
+)
 from torchrl_priors.priors import Prior
 from torchrl_priors.transforms.batch_transform import BatchTransform
 
@@ -54,7 +62,7 @@ class PriorLogProb(BatchTransform):
         traj_key (NestedKey): trajectory ids ``[*B, T]``, used if they are there. Defaults to
             ``("collector", "traj_ids")``.
         mask_key (NestedKey): bool ``[*B, T]``, false at the padding of split trajectories, used if it is there.
-            Defaults to ``("collector", "mask")``.
+            What is written there is 0. Defaults to ``("collector", "mask")``.
 
     Raises:
         ValueError: ``boundary`` needs an actor; the batch has no time dimension; the prior is over
@@ -124,30 +132,39 @@ class PriorLogProb(BatchTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the entries into a batch ``[*B, T]`` and returns it."""
         time_dim = self._find_time_dim(tensordict)
-        terminated, has_next, wanted = self._boundaries(tensordict, time_dim)
+        mask = tensordict.get(self.mask_key, None)
+        mask = None if mask is None else mask.reshape(*tensordict.batch_size, 1)
+        terminated, has_next, wanted = self._boundaries(tensordict, mask, time_dim)
         if not torch.compiler.is_compiling():
             self._warn_of_another_order(tensordict, has_next, time_dim)
         self._draw(tensordict, has_next, time_dim)
 
-        params = self.prior.get_params(tensordict)
+        actor: TensorDictModuleBase | None = self.__dict__["actor"]
+        keys = dict.fromkeys([*self.prior.in_keys, *self.prior.draw_keys, *([] if actor is None else actor.in_keys)])
+        steps = tensordict
+        if mask is not None:
+            used = (*keys, *map(under_next, keys), self.prior.action_key)
+            steps = without_padding(tensordict, used, mask.squeeze(-1))
+        params = self.prior.get_params(steps)
         dist = self.prior.build_dist(params)
         if self.keep_params:
             for key, name in zip(self.prior.out_keys, self.prior.param_names, strict=True):
                 tensordict.set(key, params[name])
-        value = self.prior.log_prob(tensordict, dist=dist).unsqueeze(-1)
+        value = self.prior.log_prob(steps, dist=dist).unsqueeze(-1)
         check_advice(value, dist)
+        value = value if mask is None else value.masked_fill(~mask, 0.0)
 
         at_boundary = torch.zeros_like(value)
         # only the time steps at which some trajectory was cut; all where code is compiled, which looks at no data
-        steps = torch.arange(value.shape[time_dim], device=value.device)
+        times = torch.arange(value.shape[time_dim], device=value.device)
         if not torch.compiler.is_compiling():
-            steps = steps[wanted.movedim(time_dim, 0).flatten(1).any(-1)]
-        if self.boundary != "zero" and len(steps):
-            keys = dict.fromkeys([*self.prior.in_keys, *self.__dict__["actor"].in_keys, *self.prior.draw_keys])
-            cut = (slice(None),) * time_dim + (steps,)
-            part = tensordict.select(*keys, *map(under_next, keys), strict=False)[cut]
-            following = next_step(part, keys, terminated[cut])
-            at_boundary.index_copy_(time_dim, steps, self._evaluate_boundary(following).to(value.dtype))
+            times = times[wanted.movedim(time_dim, 0).flatten(1).any(-1)]
+        if self.boundary != "zero" and len(times):
+            cut = (slice(None),) * time_dim + (times,)
+            part = steps.select(*keys, *map(under_next, keys), strict=False)[cut]
+            following = next_step(part, keys, terminated[cut], read(tensordict, self.done_key, "")[cut])
+            at_boundary.index_copy_(time_dim, times, self._evaluate_boundary(following).to(value.dtype))
+            at_boundary = at_boundary if mask is None else at_boundary.masked_fill(~mask, 0.0)
 
         (key,) = self.out_keys
         shifted = shift_to_next(value, at_boundary, has_next, terminated, time_dim=time_dim)
@@ -168,7 +185,9 @@ class PriorLogProb(BatchTransform):
             )
         return names.index("time")
 
-    def _boundaries(self, tensordict: TensorDictBase, time_dim: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _boundaries(
+        self, tensordict: TensorDictBase, mask: Tensor | None, time_dim: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Where an episode terminates, where a step has a next action, and where the boundary's value is wanted."""
         hint = "PriorLogProb reads where trajectories end"
         terminated, done = (read(tensordict, key, hint) for key in (self.terminated_key, self.done_key))
@@ -176,11 +195,10 @@ class PriorLogProb(BatchTransform):
         for key, flag in ((self.terminated_key, terminated), (self.done_key, done)):
             if flag.shape != expected:
                 raise ValueError(f"Expected {key!r} of shape {tuple(expected)}, got {tuple(flag.shape)}.")
-        traj_ids, mask = (tensordict.get(key, None) for key in (self.traj_key, self.mask_key))
+        traj_ids = tensordict.get(self.traj_key, None)
         has_next = has_next_action(done, None if traj_ids is None else traj_ids.reshape(expected), time_dim=time_dim)
         wanted = ~terminated
         if mask is not None:
-            mask = mask.reshape(expected)
             has_next = has_next & shift_to_next(mask, False, has_next, terminated, time_dim=time_dim)
             wanted = wanted & mask
         return terminated, has_next, wanted & ~has_next
