@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import torch
 from artifacts_cases import ACTIONS, OBS, STORABLE, Saved, net, raw_batch, save, trained
 from tensordict import TensorDict
 from torch import nn
+from torchrl.modules import MLP
 from torchrl.objectives import ClipPPOLoss
 
 from torchrl_priors import (
@@ -207,6 +209,9 @@ class TestSavingRefuses:
             (lambda: AffordancePrior(lambda x: x), "can't hold code"),
             (lambda: ModulePrior(nn.Sequential(net(), Own()), "logits"), "can't hold Own"),
             (lambda: ModulePrior(nn.Sequential(nn.ELU(0.5), net()), "logits"), "default options"),
+            (lambda: ModulePrior(nn.Sequential(OrderedDict(first=net())), "logits"), "layers have no names, got first"),
+            (lambda: ModulePrior(MLP(OBS, (1, 2)), "logits"), r"MLP that reshapes its output"),
+            (lambda: ModulePrior(MLP(6, 2), "logits", in_keys=["a", "b"]), r"read one entry, got in_keys=\['a', 'b'\]"),
             (lambda: MixturePrior([UniformPrior(2), CallablePrior(lambda x: 0, num_actions=2)]), "CallablePrior"),
             (lambda: ModulePrior(net(), "logits").adversary(), "can't hold this NegatedPrior"),
             (lambda: policy_prior(make_actor(OBS, ACTIONS).double(), None), "in float32"),

@@ -62,6 +62,13 @@ class TestPrior:
         assert torch.equal(prior(batch)["prior", "loc"], played["loc"])
         assert torch.equal(batch["prior", "scale"], played["scale"])
 
+    def test_a_layer_that_comes_twice_is_there_twice(self, tmp_path: Path) -> None:
+        twice = nn.Tanh()
+        prior = ModulePrior(nn.Sequential(nn.Linear(OBS, 4), twice, nn.Linear(4, 1), twice), "mean", std=0.1)
+        save_prior(tmp_path / "prior", prior, env_id="Toy-v0")
+        batch = raw_batch(6)
+        assert torch.equal(load_prior(tmp_path / "prior").get_dist(batch).mean, prior.get_dist(batch).mean)
+
     def test_a_loaded_prior_reads_raw_observations_never_those_that_the_student_normalised(self, saved: Saved) -> None:
         prior = load_prior(saved.path)
         assert prior.in_keys == ["observation"]

@@ -86,6 +86,10 @@ def twice(times: int) -> bytes:
         (b"\x80\x04}" + twice(60) + b"K\x01s.", "tuples in tuples"),  # hashing one never ends
         (BEFORE + twice(20) + AFTER, "tuples in tuples"),  # writing it into a message needs 100 MB
         (b"\x80\x04(" + b"K\x01" * 2000 + b"t.", "tuples in tuples"),
+        (pickle.dumps({(2**61 - 1) * number: 0 for number in range(2000)}), "more than 1000 keys that are no text"),
+        (pickle.dumps(dict.fromkeys(range(2000), 0), protocol=0), "more than 1000 keys that are no text"),
+        (pickle.dumps(set(range(2000)), protocol=4), "more than 1000 keys that are no text"),
+        (pickle.dumps(frozenset(range(2000)), protocol=4), "more than 1000 keys that are no text"),
         (b"\x80\x04]" + b"]a" * 70_000 + b".", "more than 131072 steps"),
         (BEFORE + b"(" + b"\x8a\xff" + b"\x7f" * 255 + b"t" + AFTER, r"array of shape \(\d+\.\.\."),
         (BEFORE + b"(" + b"K\x01" * 40 + b"t" + AFTER, r"array of shape \(1, 1, "),
@@ -115,7 +119,15 @@ def test_arrays_of_one_buffer_do_not_fill_the_memory() -> None:
         read_pickle(pickle.dumps([View(data), View(data)]))
 
 
-@pytest.mark.parametrize("value", [{(1, (2, 3)): ((), ((),))}, np.arange(3), spaces.Tuple([spaces.Discrete(2)] * 3)])
+@pytest.mark.parametrize(
+    "value",
+    [
+        {(1, (2, 3)): ((), ((),))},
+        {str(n): n for n in range(2000)},
+        np.arange(3),
+        spaces.Tuple([spaces.Discrete(2)] * 3),
+    ],
+)
 def test_honest_pickles_are_read(value: Any) -> None:
     for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
         check_program(pickle.dumps([value, value], protocol=protocol))

@@ -237,6 +237,8 @@ class TestWhatIsForgotten:
         convert(saved(name), name, action_spec=env.base_env.action_spec)
         with pytest.raises(ArtifactError, match=r"acts within .*2\.0, 0\.75.* within .*RescaledPrior"):
             convert(saved(name), name, action_spec=env.action_spec)
+        with pytest.raises(ArtifactError, match=r"acts within .*2\.0, 0\.75"):
+            convert(saved(name), name, action_spec=env.action_spec, clip_mean=False)
         prior = RescaledPrior(convert(saved(name), name), *map(torch.as_tensor, (BOX.low, BOX.high)))
         batch = batch_of(observations(MODELS[name], 20))
         mean = prior.get_dist(batch).deterministic_sample if name == "sac" else prior.get_dist(batch).mean

@@ -79,6 +79,14 @@ def weights(good: dict[str, torch.Tensor]) -> Iterator[tuple[str, bytes]]:
     data = saved(good)
     for label, program in (("deep", DEEP), ("twice", TWICE), ("many", MANY)):
         yield label, rezipped(data, lambda member, content, p=program: p if member.endswith("data.pkl") else content)
+    deep = rezipped(data, lambda member, content: DEEP if member.endswith("data.pkl") else content)
+    yield "upper case", deep.replace(b"data.pkl", b"data.PKL")
+    claims = START + b"}X\x01\x00\x00\x00ac__builtin__\nbytearray\n" + pickle.dumps(1 << 40)[2:-1] + b"\x85Rs."
+    yield "bytearray", rezipped(data, lambda member, content: claims if member.endswith("data.pkl") else content)
+    shared, other = torch.zeros(256, 256), torch.zeros(1)
+    yield "shared", saved({**good, **{f"mlp_extractor.policy_net.{2 * i}.weight": shared for i in range(1, 40)}})
+    other.numel = 5
+    yield "attributes", saved({**good, name: other})
     yield from legacy(good)
     packed = saved({**good, "value_net.bias": torch.zeros(1 << 21)})
     yield "packed", rezipped(packed, lambda member, content: content, zipfile.ZIP_DEFLATED)
@@ -165,6 +173,9 @@ def models(good: bytes, draw: random.Random) -> Iterator[tuple[str, bytes]]:
     ]
     for content in texts:
         yield "data", replaced("data", content)
+    data = rezipped(good, lambda name, old: b" " * (1 << 28) if name == "data" else old, zipfile.ZIP_BZIP2)
+    at = data.rfind(b"PK\x01\x02", 0, data.rfind(b"PK\x01\x02"))  # the directory says that it is short
+    yield "bz2", data[: at + 24] + (100).to_bytes(4, "little") + data[at + 28 :]
     for change in ({"use_sde": True}, {"policy_class": None}, {"policy_class": {"__module__": "\x1b[2J" * 1000}}):
         yield "entry", replaced("data", json.dumps({**values, **change}).encode())
     for member in ("data", "policy.pth"):

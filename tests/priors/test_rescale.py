@@ -78,6 +78,21 @@ def test_bounds_that_differ_are_refused_where_both_are_known(tmp_path: Any) -> N
         load_prior(path, observation_spec=3, action_spec=Bounded(LOW, same, shape=(2,)).expand(4, 2))
         with pytest.raises(ArtifactError, match=r"acts within .*-2.0, 0.0.*, and the student within .*RescaledPrior"):
             load_prior(path, observation_spec=3, action_spec=behind)
+    both = MixturePrior(
+        [
+            clipped,
+            TEACHERS["gaussian"](),
+            ModulePrior(
+                nn.Sequential(
+                    nn.Linear(3, 2), ClipToBox(behind.space.low, behind.space.high), StateIndependentStd(LOW)
+                ),
+                "mean_std",
+            ),
+        ]
+    )
+    save_prior(tmp_path / "both", both, env_id="Toy-v0")
+    with pytest.raises(ArtifactError, match=r"acts within .*-2.0, 0.0"):
+        load_prior(tmp_path / "both", observation_spec=3, action_spec=behind)
     save_prior(tmp_path / "free", TEACHERS["gaussian"](), env_id="Toy-v0")
     load_prior(tmp_path / "free", observation_spec=3, action_spec=behind)  # its bounds are not known
 

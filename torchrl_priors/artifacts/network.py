@@ -24,14 +24,19 @@ from torchrl_priors.priors.layers import (
 )
 
 Parts = dict[str, Any]
-_MAX_SIZES = 100  # of one layer: a description must not make more layers than its tensors could fill
+_MAX_SIZES = 100  # of a tensor or a multilayer perceptron
 
 
 def describe_network(network: nn.Module) -> Parts:
     """What kind of layers a network has, and their options: numbers as they are, a tensor by its shape."""
     kind = type(network)
+    layers: Any = network._modules if kind in (nn.Sequential, MLP) else {}  # children() leaves repeated ones out
+    if list(layers) != [str(number) for number in range(len(layers))]:
+        raise TypeError(f"A file can hold a Sequential whose layers have no names, got {', '.join(layers)}.")
+    if kind is MLP and not isinstance(network.out_features, int):
+        raise TypeError(f"A file can't hold an MLP that reshapes its output: it has {network.out_features=}.")
     if kind in (nn.Sequential, MLP):
-        return {"layer": "sequential", "layers": [describe_network(layer) for layer in network.children()]}
+        return {"layer": "sequential", "layers": [describe_network(layer) for layer in layers.values()]}
     for name, (known, options) in _LAYERS.items():
         if kind is known:
             parts = {"layer": name, **{option: _to_json(getattr(network, option)) for option in options}}
@@ -50,6 +55,8 @@ def build_network(parts: Any, tensors: dict[str, Tensor], prefix: str = "") -> n
 
     What does not fit, or is not finite, is an :class:`ArtifactError`; messages put ``prefix`` before a tensor's name.
     """
+    if _count_layers(parts) > 4 * (len(tensors) + 8):  # else they would all be made before one is found to be missing
+        raise ArtifactError("its network has more layers than its tensors could fill")
     network = _skeleton(parts)
     expected = _sizes(network)
     if tensors.keys() != expected.keys():
@@ -104,6 +111,17 @@ def _to_json(value: Any) -> Any:
     if isinstance(value, Tensor):
         return list(value.shape)
     return [_to_json(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _count_layers(parts: Any) -> int:
+    """How many layers a description stands for, those of its lists of sizes included."""
+    number, waiting = 0, [parts]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, dict):
+            waiting += [item for value in part.values() if isinstance(value, list) for item in value]
+        number += 1
+    return number
 
 
 def _skeleton(parts: Any) -> nn.Module:

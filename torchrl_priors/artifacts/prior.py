@@ -98,7 +98,7 @@ def _describe_module(prior: ModulePrior, scope: Scope) -> Parts:
         raise TypeError(f"A file can hold the distribution_kwargs low and high, got {', '.join(sorted(kwargs))}.")
     scope.put({name: torch.as_tensor(value) for name, value in kwargs.items()})
     return {
-        "network": put_network(params.network, scope),
+        "network": put_network(params.network, scope, prior.in_keys),
         "output": prior.output,
         "distribution": name_distribution(prior),
         "box": bool(kwargs),

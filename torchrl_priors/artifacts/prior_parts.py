@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict import NestedKey
@@ -65,8 +65,10 @@ class Scope:
         return {"low": low, "high": high}
 
 
-def put_network(network: Any, scope: Scope) -> Parts:
-    """Describes a network, and puts its tensors."""
+def put_network(network: Any, scope: Scope, in_keys: Sequence[NestedKey]) -> Parts:
+    """Describes a network of one input, and puts its tensors."""
+    if len(in_keys) != 1:
+        raise TypeError(f"A file can hold networks that read one entry, got in_keys={list(in_keys)}.")
     if not isinstance(network, nn.Module):
         raise TypeError(f"A file can't hold code, such as the function {network!r}.")
     scope.inside("network").put(network.state_dict())
@@ -82,7 +84,7 @@ def take_network(parts: Any, scope: Scope) -> nn.Module:
 def put_source(source: TensorDictModuleBase, scope: Scope) -> Parts:
     """Describes a table or a network, and puts its tensors."""
     if type(source) is TensorDictModule:
-        return {"network": put_network(source.module, scope), "in_keys": keys_to_json(source.in_keys)}
+        return {"network": put_network(source.module, scope, source.in_keys), "in_keys": keys_to_json(source.in_keys)}
     if type(source) in (StateTable, Constant):
         scope.put({"table": source.table if isinstance(source, StateTable) else source.weights})
         return {"in_keys": keys_to_json(source.in_keys)}

@@ -11,13 +11,13 @@ from typing import Any, Literal, TypeAlias
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import OneHotCategorical, TanhNormal
 
 from torchrl_priors.artifacts.errors import ArtifactError, refusing, short
 from torchrl_priors.artifacts.sb3_files import Checkpoint, Statistics, read_checkpoint, read_vecnormalize
 from torchrl_priors.artifacts.sb3_network import Family, action_bounds, build_layers, find_family
-from torchrl_priors.artifacts.spaces import check_spaces
+from torchrl_priors.artifacts.spaces import check_bounds, check_spaces
 from torchrl_priors.networks import ACTIVATIONS
 from torchrl_priors.priors import BoltzmannPrior, ModulePrior
 
@@ -47,8 +47,8 @@ def load_sb3_prior(
     r"""A policy of Stable-Baselines3 as a teacher, from the file that ``model.save`` wrote.
 
     It reads PPO, A2C, SAC, TD3, DDPG and DQN of ``stable_baselines3``, and TQC, TRPO and QR-DQN of ``sb3_contrib``.
-    Neither need be installed, and no code of the files runs: weights are loaded by
-    ``torch.load(weights_only=True)``, and of what is pickled only numbers, arrays and names are read.
+    Neither need be installed, and no code of the files runs: of what is pickled only tensors, numbers, arrays and names
+    are read.
 
     What the teacher's distribution is, in the unit of the environment's actions:
 
@@ -141,6 +141,9 @@ def load_sb3_prior(
             prior = ModulePrior(network, output, std=std, **kwargs)
         if action_spec is not None:
             check_spaces(prior, checkpoint.observation_space.shape, action_spec)
+            if isinstance(action_spec, Bounded):  # its layers have no bounds with clip_mean=False
+                space = checkpoint.action_space
+                check_bounds((torch.as_tensor(space.low), torch.as_tensor(space.high)), action_spec)
     return prior.to(device)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 import re
 import sys
@@ -18,8 +17,7 @@ from torch import Tensor
 
 from torchrl_priors.artifacts.errors import ArtifactError, InertPickleError, refusing, short
 from torchrl_priors.artifacts.inert_pickle import MAX_BYTES, StandIn, read_pickle
-from torchrl_priors.artifacts.legacy_torch import LEGACY_START, read_legacy
-from torchrl_priors.artifacts.pickle_program import check_program
+from torchrl_priors.artifacts.torch_files import read_torch
 
 _MAX_WEIGHTS = 1 << 30  # bytes, unpacked; of all else, MAX_BYTES
 _OLDER = re.compile(rb"stable_baselines\.\w")
@@ -119,14 +117,18 @@ def _member(archive: zipfile.ZipFile, name: str) -> bytes:
     if name not in archive.namelist():
         raise ArtifactError(f"it has no {name}: it is no model of Stable-Baselines3")
     limit = _MAX_WEIGHTS if name == "policy.pth" else MAX_BYTES
-    if archive.getinfo(name).file_size > limit:
+    entry = archive.getinfo(name)
+    if entry.file_size > limit:
         raise ArtifactError(f"its {name} is longer than {limit} bytes")
-    return archive.read(name)
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others are unpacked without a limit
+        raise ArtifactError(f"its {name} is compressed in a way that Stable-Baselines3 does not use")
+    with archive.open(entry) as file:
+        return file.read(entry.file_size + 1)  # what is unpacked may be more than the directory says
 
 
 def _weights(data: bytes) -> dict[str, Tensor]:
     try:
-        weights = read_legacy(data) if data.startswith(LEGACY_START) else _read_zipped(data)
+        weights = read_torch(data)
     except Exception as error:  # a damaged file fails in any way
         reason = (str(error).splitlines() or [""])[0]
         raise ArtifactError(f"its policy.pth can't be read as tensors: {type(error).__name__}: {reason}") from None
@@ -135,24 +137,11 @@ def _weights(data: bytes) -> dict[str, Tensor]:
     ):
         raise ArtifactError("its policy.pth is no dictionary of tensors")
     for name, value in weights.items():
-        if value.layout is not torch.strided or value.device.type != "cpu":
-            raise ArtifactError(f"{short(name)} must be a plain tensor, got {value.layout} on {value.device.type}")
         if value.numel() * value.element_size() > len(data):  # a view of one number as many
             raise ArtifactError(f"{short(name)} of shape {tuple(value.shape)} is larger than the file")
+    if sum(value.numel() * value.element_size() for value in weights.values()) > 4 * len(data):
+        raise ArtifactError("its tensors are larger than the file")  # a features extractor may be there three times
     return dict(weights)
-
-
-def _read_zipped(data: bytes) -> Any:
-    """Runs no code; but PyTorch hashes what the pickle says, and unpacks what it claims, which is checked before."""
-    if not data.startswith(b"PK\x03\x04"):  # by which PyTorch knows it
-        raise ValueError("it is no zip of torch.save")
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > 2 * len(data):  # torch.save does not compress
-            raise ValueError("its entries are larger than it is")
-        for entry in archive.infolist():
-            if entry.filename.endswith(".pkl"):
-                check_program(archive.read(entry))
-    return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
 
 
 def _space(values: dict[str, Any], name: str) -> Space:

@@ -14,7 +14,7 @@ from torchrl.modules import TanhNormal
 
 from torchrl_priors.artifacts.errors import ArtifactError, short
 from torchrl_priors.distributions import TORCHRL_ONE_HOT, BoxUniform, action_shape
-from torchrl_priors.priors import Prior
+from torchrl_priors.priors import MixturePrior, Prior
 from torchrl_priors.priors.layers import ClipToBox, ScaleToBox
 
 Spec: TypeAlias = TensorSpec | Sequence[int] | int
@@ -39,23 +39,23 @@ def check_spaces(prior: Prior, observation_spec: Spec, action_spec: Spec | None 
     if action_spec is not None:
         _check_actions(dist, action_spec)
         if isinstance(action_spec, Bounded):
-            _check_bounds(_known_bounds(prior, dist), action_spec)
+            for bounds in _known_bounds(prior, dist):
+                check_bounds(bounds, action_spec)
 
 
-def _known_bounds(prior: Prior, dist: Any) -> tuple[Tensor, Tensor] | None:
-    """The bounds of a prior's actions: of its distribution, or of the last of its layers that have some."""
+def _known_bounds(prior: Prior, dist: Any) -> list[tuple[Tensor, Tensor]]:
+    """The bounds of a prior's actions, where they are known: of its distribution, or the last of its layers."""
     if isinstance(dist, TanhNormal):
-        return torch.as_tensor(dist.low), torch.as_tensor(dist.high)
+        return [(torch.as_tensor(dist.low), torch.as_tensor(dist.high))]
     if isinstance(dist, BoxUniform):
-        return dist.base_dist.low, dist.base_dist.high
-    boxes = [layer for layer in prior.modules() if isinstance(layer, (ClipToBox, ScaleToBox))]
-    return (boxes[-1].low, boxes[-1].high) if boxes else None
+        return [(dist.base_dist.low, dist.base_dist.high)]
+    parts = prior.priors if isinstance(prior, MixturePrior) else [prior]
+    boxes = [[layer for layer in part.modules() if isinstance(layer, (ClipToBox, ScaleToBox))] for part in parts]
+    return [(layers[-1].low, layers[-1].high) for layers in boxes if layers]
 
 
-def _check_bounds(bounds: tuple[Tensor, Tensor] | None, spec: Bounded) -> None:
-    """Holds the bounds of the teacher against the student's, where there are some."""
-    if bounds is None:
-        return
+def check_bounds(bounds: tuple[Tensor, Tensor], spec: Bounded) -> None:
+    """Holds the bounds of a teacher's actions against the student's."""
     of_student = spec.space.low, spec.space.high
     for mine, student in zip(bounds, of_student, strict=True):
         mine, student = torch.broadcast_tensors(mine.to(student), student)
