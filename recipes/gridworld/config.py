@@ -73,7 +73,7 @@ class Bootstrap:
     """Confidence intervals."""
 
     reps: int = positive(below=2**31)
-    seed: int = MISSING
+    seed: int = at_least_0()
 
 
 @dataclass

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 
 from recipes.common.run_folder import write_file
-from recipes.metrics import ConfidenceInterval
+from recipes.metrics import MIN_RUNS, ConfidenceInterval, stratified_bootstrap_ci
 from recipes.plots import (
     curve_panels,
     interval_panels,
@@ -21,7 +21,7 @@ from recipes.plots import (
     profile_panels,
     save_figure,
 )
-from recipes.report.markdown import interval, pivot, plus_minus, table
+from recipes.report.markdown import interval, pivot, table
 
 __all__ = ["summary", "write"]
 
@@ -100,9 +100,17 @@ def _figures(tables: dict[str, pd.DataFrame], profiles: dict[str, np.ndarray] | 
         ),
     }
     if profiles is not None:
-        shown = {"All priors": profiles}
-        found["performance_profiles"] = profile_panels(shown, np.linspace(-1, 1, 201))
+        taus = np.linspace(-1, 1, 201)
+        bands = {method: _profile(ratios, taus) for method, ratios in profiles.items()}
+        found["performance_profiles"] = profile_panels({"All priors": bands}, taus)
     return found
+
+
+def _profile(ratios: np.ndarray, taus: np.ndarray) -> ConfidenceInterval:
+    """The performance profile of ratios ``[worlds, priors]``; all priors of a world have one baseline, so they stay."""
+    above = (ratios[..., None] > taus).mean(1)
+    band = stratified_bootstrap_ci(above[:, None], np.mean)
+    return band if len(ratios) >= MIN_RUNS else band._replace(low=band.estimate, high=band.estimate)
 
 
 def _by_prior(ratios: pd.DataFrame, columns: list[str]) -> dict[str, dict[str, ConfidenceInterval]]:
@@ -141,7 +149,8 @@ def _page(folder: Path, out: Path, config: dict[str, Any], tables: dict[str, pd.
             _named(pairs, lambda row: _thousandths(*row[["iqm_difference", "ci_low", "ci_high"]])),
         ]
     if len(weights := tables["prior_weights"]):
-        parts += ["## Prior weight in evaluation episodes", "Mean ± half of the 95 % interval:", _weights(weights)]
+        heading = "## Prior weight in evaluation episodes"
+        parts += [heading, "Mean and 95 % interval, by resampling worlds:", _weights(weights)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -170,12 +179,15 @@ def _weights(weights: pd.DataFrame) -> str:
             prior_label(row["prior"]),
             method_label(row["method"]),
             row["average"],
-            plus_minus(row["degraded"], row["degraded_ci"], 3),
-            plus_minus(row["non_degraded"], row["non_degraded_ci"], 3),
+            *(_weight(row, name) for name in ("degraded", "non_degraded", "gap")),
         ]
         for _, row in weights.iterrows()
     ]
-    return table(["prior", "method", "average over", "degraded", "non-degraded"], rows, text_columns=3)
+    return table(["prior", "method", "average over", "degraded", "non-degraded", "gap"], rows, text_columns=3)
+
+
+def _weight(row: pd.Series, name: str) -> str:
+    return interval(row[name], row[f"{name}_ci_low"], row[f"{name}_ci_high"], digits=3)
 
 
 def summary(folder: Path) -> str:
@@ -191,10 +203,11 @@ def summary(folder: Path) -> str:
             prior = ""
     parts.append("\n".join(lines))
     if len(weights := _table(folder / "prior_weights.csv", optional=True)):
-        by_visit = weights[weights["average"] == "visit"].drop(columns="average")
-        by_visit = by_visit.rename(columns={"non_degraded": "other", "non_degraded_ci": "other_ci"})
-        parts.append("Prior weight in evaluation episodes, by visit (+- 95 % CI)")
-        parts.append(by_visit.to_string(index=False, float_format=lambda value: f"{value:.3f}"))
+        lines = [f"{'prior':16}{'method':10}{'degraded':>22}{'other':>22}"]
+        for _, row in weights[weights["average"] == "visit"].iterrows():
+            cells = "".join(f"{_weight(row, name):>22}" for name in ("degraded", "non_degraded"))
+            lines.append(f"{row['prior']:16}{row['method']:10}{cells}")
+        parts.append("Prior weight in evaluation episodes, by visit (95 % CI)\n" + "\n".join(lines))
     return "\n\n".join(parts)
 
 

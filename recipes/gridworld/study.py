@@ -23,7 +23,7 @@ from recipes.gridworld.tables import Episodes, prior_weight_curves, tables_of
 from recipes.gridworld.worlds import GridWorlds, sample_worlds
 
 #: What the results do not depend on.
-_INCIDENTAL = ("out", "workers", "block_worlds")
+_INCIDENTAL = ("out", "workers", "block_worlds", "bootstrap")
 
 
 def open_folder(cfg: GridworldConfig) -> RunFolder:
@@ -108,28 +108,35 @@ class TaughtWorld:
         *,
         watch: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The evaluation episodes of a student, ``[points, 8]``; its weights and visits at each if they are watched."""
+        """The evaluation episodes of a student, ``[points, 6]``; its weights and visits at each if they are watched."""
         points, states = self.cfg.evaluation.points, len(self.world.state)
         log, weights = np.zeros((points, len(tabular.LOG_FIELDS))), np.zeros((points if watch else 0, states))
         visits = np.zeros(weights.shape, np.int64)
+        tables = run_parts.new_tables(states, learner.adaptive)
         tabular.train(
             self.world,
             advice,
             learner,
-            run_parts.new_tables(states, learner.adaptive),
+            tables,
             self.cfg.evaluation.interval,
             log,
             weights,
             visits,
             run_parts.generator(self.seed, "student", method, prior),
         )
+        if not all(np.isfinite(table).all() for table in (tables.logits, tables.value, tables.weight)):
+            raise ValueError(
+                f"The student of {method} with the prior {prior or 'none'} in the world of seed {self.seed} diverged:"
+                f" expected smaller rates than student.lr={self.cfg.student.lr} and student.lr_weight, or a smaller"
+                f" student.bonus_coeff than {self.cfg.student.bonus_coeff}."
+            )
         return log, weights, visits
 
 
 def run_world(
     cfg: GridworldConfig, seed: int, by_method: dict[str, run_parts.Learner], progress: Callable[[int], Any]
 ) -> dict[str, Any]:
-    """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 8]``."""
+    """Facts about a world, and the evaluation episodes of all of its students, ``[pairs, points, 6]``."""
     taught = TaughtWorld(cfg, seed)
     progress(cfg.teacher.steps)
     advice = {prior: taught.advice(prior) for prior in ("", *cfg.priors)}
@@ -145,10 +152,8 @@ def run_study(cfg: GridworldConfig, folder: RunFolder) -> dict[str, np.ndarray]:
     by_method = {method: make_learner(cfg, method) for method in cfg.methods}
     pairs, budget = run_parts.runs_of(cfg.methods, cfg.priors), cfg.evaluation.points * cfg.evaluation.interval
     per_world = cfg.teacher.steps + len(pairs) * budget
-    blocks = {
-        f"blocks/{first:06d}": range(first, min(first + cfg.block_worlds, cfg.worlds))
-        for first in range(0, cfg.worlds, cfg.block_worlds)
-    }
+    spans = [range(at, min(at + cfg.block_worlds, cfg.worlds)) for at in range(0, cfg.worlds, cfg.block_worlds)]
+    blocks = {f"blocks/{span.start:06d}-{span.stop:06d}": span for span in spans}
     # Read at once what is there, so that a damaged file is found before any work.
     kept = {name: folder.arrays(name) for name in blocks if folder.has(name)}
     missing = [name for name in blocks if name not in kept]

@@ -92,30 +92,32 @@ def _difference_of_iqms(scores: np.ndarray, axis: int) -> np.ndarray:
 
 
 def prior_weight_table(cfg: GridworldConfig, data: Episodes) -> pd.DataFrame:
-    """Mean prior weight of degraded and other states met in evaluation episodes, averaged over visits and episodes."""
+    """Mean prior weight of degraded and other states that evaluation episodes met, and their gap.
+
+    Worlds are resampled whole: the visits of one student are no independent samples.
+    """
     rows = []
     for prior in cfg.priors:
         for method in cfg.methods:
             if prior.startswith("structural") and get_method(method).adaptive:
-                sums = {name: data.of(method, prior, name).ravel() for name in LOG_FIELDS[2:]}
-                by_visit, by_episode = [], []
-                for group in ("degraded", "other"):
-                    total, square, count = (sums[f"{kind}_{group}"] for kind in ("w", "w2", "n"))
-                    by_visit += _mean_and_ci_of_sums(total.sum(), square.sum(), count.sum())
-                    met = total[count > 0] / count[count > 0]
-                    by_episode += _mean_and_ci_of_sums(met.sum(), (met**2).sum(), len(met))
-                rows += [(prior, method, "visit", *by_visit), (prior, method, "episode", *by_episode)]
-    columns = ["prior", "method", "average", "degraded", "degraded_ci", "non_degraded", "non_degraded_ci"]
-    return pd.DataFrame(rows, columns=columns)
+                sums = [data.of(method, prior, name) for name in LOG_FIELDS[2:]]
+                episodes = [part for w, n in (sums[:2], sums[2:]) for part in (w / np.maximum(n, 1), n > 0)]
+                for average, parts in (("visit", sums), ("episode", episodes)):
+                    of_worlds = np.stack([part.sum(-1) for part in parts], -1)[:, None]
+                    with np.errstate(invalid="ignore"):  # a resample without a visit: NaN
+                        found = stratified_bootstrap_ci(
+                            of_worlds, _means_and_gap, reps=cfg.bootstrap.reps, seed=cfg.bootstrap.seed
+                        )
+                    rows.append((prior, method, average, *np.stack(found, -1).ravel()))
+    names = (f"{name}{end}" for name in ("degraded", "non_degraded", "gap") for end in ("", "_ci_low", "_ci_high"))
+    return pd.DataFrame(rows, columns=["prior", "method", "average", *names])
 
 
-def _mean_and_ci_of_sums(total: float, square: float, count: float) -> list[float]:
-    """Mean and 1.96 standard errors of it, from a sum, a sum of squares and a number."""
-    if count == 0:
-        return [np.nan, np.nan]
-    mean = total / count
-    deviation = max(square / count - mean**2, 0.0) ** 0.5
-    return [mean, 1.96 * deviation / count**0.5]
+def _means_and_gap(sums: np.ndarray, axis: int) -> np.ndarray:
+    """From sums and numbers of two groups, ``[..., 4]``: the mean of each, and that of the second minus the first."""
+    total = sums.sum(axis)
+    first, second = total[..., 0] / total[..., 1], total[..., 2] / total[..., 3]
+    return np.stack([first, second, second - first], -1)
 
 
 def world_table(results: dict[str, np.ndarray], data: Episodes) -> pd.DataFrame:

@@ -19,7 +19,7 @@ __all__ += ["train_episode"]
 
 #: What is kept of every evaluation episode: return and length; sum, sum of squares and number of the prior weights
 #: at visits of degraded states; the same at the other states.
-LOG_FIELDS = ("return", "length", "w_degraded", "w2_degraded", "n_degraded", "w_other", "w2_other", "n_other")
+LOG_FIELDS = ("return", "length", "w_degraded", "n_degraded", "w_other", "n_other")
 
 # Without `_nrt` Numba would count references to every table at every step, which takes as long as all of the rest. The
 # price: nothing is allocated in here, arrays come from outside.
@@ -212,13 +212,12 @@ def play_episode(world: World, advice: Advice, tables: Tables, log: np.ndarray, 
     cell, done = world.start, False
     while not done:
         state = world.state[cell]
-        weight, group = tables.weight[state], 2 if advice.degraded[state] else 5
+        weight, group = tables.weight[state], 2 if advice.degraded[state] else 4
         cell, reward, done = step(world, cell, best_action(tables.logits, state, 0.0), rng.random(), rng.random())
         log[0] += reward
         log[1] += 1
         log[group] += weight
-        log[group + 1] += weight**2
-        log[group + 2] += 1
+        log[group + 1] += 1
 
 
 @compiled
@@ -235,7 +234,7 @@ def train(
 ) -> None:
     """A whole run: an evaluation episode after every ``interval`` transitions; the last row of ``log`` ends it.
 
-    ``log`` is ``[points, 8]``, zeros. ``weights`` and ``visits``, ``[points, C]``, are filled with the tables at each
+    ``log`` is ``[points, 6]``, zeros. ``weights`` and ``visits``, ``[points, C]``, are filled with the tables at each
     evaluation, unless they have no rows.
     """
     steps = point = 0

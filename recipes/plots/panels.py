@@ -116,7 +116,7 @@ def profile_panels(
     The dashed line marks 0, no improvement over the baseline. A method with fewer than four runs has no band.
 
     Args:
-        panels: by title and method, area ratios ``[runs]`` or ``[runs, tasks]``.
+        panels: by title and method, area ratios ``[runs]`` or ``[runs, tasks]``, or with ``thresholds`` a profile.
         thresholds: ``[points]``, ascending. By default from -1 to what one run in fifty exceeds, at least 1
             and at most 10.
 
@@ -145,9 +145,12 @@ def profile_panels(
     for (title, profiles), ax in zip(panels.items(), axes.values(), strict=True):
         ax.axvline(0, color="0.35", linestyle=(0, (3, 2)), linewidth=0.9, zorder=1.5)
         for name, scores in profiles.items():
-            band = performance_profile(scores, taus, confidence=confidence, reps=reps, seed=seed)
-            if len(scores) < MIN_RUNS:
-                band = band._replace(low=band.estimate, high=band.estimate)
+            if isinstance(scores, ConfidenceInterval):
+                band = scores
+            else:
+                band = performance_profile(scores, taus, confidence=confidence, reps=reps, seed=seed)
+                if len(scores) < MIN_RUNS:
+                    band = band._replace(low=band.estimate, high=band.estimate)
             _draw_band(ax, taus, band, styles[name], f"profile of {name!r}")
         ax.set_title(title, linespacing=1.05)
         ax.set(xlim=(taus.min(), taus.max()), ylim=(0, 1))

@@ -218,8 +218,8 @@ class PlainStudent:
             best = np.argmax(np.round(self.logits[state], 9))
             cell, reward, done = self.world.step(cell, int(best), rng)
             weight, group = self.weight(state), "degraded" if state in self.degraded else "other"
-            names = ("return", "length", f"w_{group}", f"w2_{group}", f"n_{group}")
-            for name, amount in zip(names, (reward, 1, weight, weight**2, 1), strict=True):
+            names = ("return", "length", f"w_{group}", f"n_{group}")
+            for name, amount in zip(names, (reward, 1, weight, 1), strict=True):
                 episode[name] += amount
         return list(episode.values())
 

@@ -18,8 +18,10 @@ from composed import with_another_hash_seed
 from omegaconf import OmegaConf
 
 from recipes.gridworld.__main__ import main
+from recipes.gridworld.page import _profile
 from recipes.gridworld.run_parts import runs_of
 from recipes.gridworld.study import open_folder
+from recipes.gridworld.tables import Episodes, prior_weight_table
 from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors.methods import METHODS
 
@@ -90,7 +92,7 @@ def test_tables_have_the_promised_columns(small):
     }
     assert columns["area_ratio"][:5] == ["prior", "method", "iqm", "ci_low", "ci_high"]
     assert "paper_iqm" in columns["area_ratio"]
-    values = ["degraded", "degraded_ci", "non_degraded", "non_degraded_ci"]
+    values = [f"{name}{end}" for name in ("degraded", "non_degraded", "gap") for end in ("", "_ci_low", "_ci_high")]
     assert columns["prior_weights"] == ["prior", "method", "average", *values]
     wanted = {"seed", "distinct_states", "teacher_return", "teacher_length", "reachable_goal", "baseline_area"}
     assert wanted <= set(columns["worlds"])
@@ -126,6 +128,29 @@ def test_tables_say_what_the_episodes_say(small):
         by_visit, by_episode = total.sum() / count.sum(), (total[count > 0] / count[count > 0]).mean()
         assert weights.loc[("structural_10", "aligned", "visit"), name] == pytest.approx(by_visit, rel=1e-5)
         assert weights.loc[("structural_10", "aligned", "episode"), name] == pytest.approx(by_episode, rel=1e-5)
+    assert (weights["gap"] - weights["non_degraded"] + weights["degraded"]).abs().max() < 1e-5
+
+
+def test_intervals_of_the_prior_weight_are_those_of_worlds():
+    cfg = OmegaConf.create(
+        {"methods": ["none", "ae2r"], "priors": ["structural_3"], "bootstrap": {"reps": 500, "seed": 0}}
+    )
+    rng, worlds = np.random.default_rng(0), 50
+    episodes = np.zeros((worlds, 2, 20, len(LOG_FIELDS)))
+    visits = rng.integers(1, 9, (worlds, 20))
+    for group, mean in (("degraded", 0.3), ("other", 0.4)):  # a world's weight is that of all its visits
+        episodes[:, 1, :, LOG_FIELDS.index(f"n_{group}")] = visits
+        episodes[:, 1, :, LOG_FIELDS.index(f"w_{group}")] = visits * rng.normal(mean, 0.1, (worlds, 1))
+    row = prior_weight_table(cfg, Episodes(cfg, episodes)).set_index("average").loc["episode"]
+    for name, error in (("degraded", 0.1), ("non_degraded", 0.1), ("gap", 0.1 * 2**0.5)):
+        half = (row[f"{name}_ci_high"] - row[f"{name}_ci_low"]) / 2
+        assert half == pytest.approx(1.96 * error / worlds**0.5, rel=0.3)
+
+
+def test_performance_profiles_resample_whole_worlds():
+    ratios = np.random.default_rng(0).normal(size=(100, 1)).repeat(7, 1)  # all priors of a world are alike
+    band, alone = (_profile(array, np.zeros(1)) for array in (ratios, ratios[:, :1]))
+    assert (band.high - band.low)[0] == pytest.approx((alone.high - alone.low)[0])
 
 
 def test_figures_are_there_and_the_terminal_names_every_file(small):
@@ -186,6 +211,22 @@ def test_results_do_not_depend_on_how_the_work_is_divided(five, how, tmp_path):
 
 
 @pytest.mark.usefixtures("without_pictures")
+def test_a_study_goes_on_with_other_blocks(five, tmp_path):
+    for size in (2, 3, 1):
+        assert recipe(*FIVE, f"block_worlds={size}", f"out={tmp_path / 'again'}") == 0
+        assert tables(tmp_path / "again") == tables(five)
+
+
+def test_a_student_that_diverges_is_named(tmp_path, capfd):
+    assert (
+        recipe("worlds=1", "priors=[expert]", "methods=[none,e2r]", "student.lr=1e300", f"out={tmp_path / 'out'}") != 0
+    )
+    said = "".join(capfd.readouterr())
+    assert "diverged" in said
+    assert "student.lr=1e+300" in said
+
+
+@pytest.mark.usefixtures("without_pictures")
 def test_worlds_are_the_same_in_a_larger_study(small, tmp_path):
     out = tmp_path / "more"
     assert recipe("worlds=4", "seed=1", "priors=[structural_3]", "methods=[none,aer]", f"out={out}") == 0
@@ -226,6 +267,7 @@ def test_worlds_are_the_same_in_a_larger_study(small, tmp_path):
         ("evaluation.points=0", "evaluation.points=0"),
         ("evaluation.interval=0", "evaluation.interval=0"),
         ("bootstrap.reps=0", "bootstrap.reps=0"),
+        ("bootstrap.seed=-1", "bootstrap.seed=-1"),
         ("block_worlds=0", "block_worlds=0"),
         ("workers=0", "workers=0"),
         ("seed=-1", "seed=-1"),
