@@ -63,6 +63,7 @@ class Checkpoints:
             ValueError: there are checkpoints, and none is whole, or it could run code; the message names the file.
         """
         if (path := self.newest()) is None:
+            self.clear()  # of one that was broken off
             return False
         Checkpoint(**stage).load(path, components=list(stage))
         if rest := parts():
@@ -70,7 +71,7 @@ class Checkpoints:
         return True
 
     def newest(self) -> Path | None:
-        """The newest one that is whole, None where there is none at all; damaged ones are named.
+        """The newest one that is whole, None where none was ever whole; damaged ones are named.
 
         Raises:
             ValueError: there are some, and none is whole, or one could run code.
@@ -83,7 +84,9 @@ class Checkpoints:
                     print(f"{line}: going on from {path.name}.", file=sys.stderr, flush=True)
                 return path
             damaged.append(damage)
-        if damaged:
+        if len(damaged) == 1 and not _seal(self._all()[0]).exists():  # the process was killed in its first checkpoint
+            print(f"{damaged[0]}: starting anew.", file=sys.stderr, flush=True)
+        elif damaged:
             raise ValueError(
                 f"{'; '.join(damaged)}. No checkpoint is whole: put back what was damaged, or start anew with"
                 " resume=false."

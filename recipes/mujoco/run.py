@@ -70,7 +70,7 @@ class Run:
         self.folder = RunFolder(path, matters, OmegaConf.to_yaml(cfg, resolve=True), may_grow=longer)
         self.evaluations: list[dict[str, Any]] = []
         self.metrics: list[dict[str, Any]] = []
-        self.checkpoints = Checkpoints(path / "checkpoints", cfg.checkpoint.keep, identity(matters))
+        self.checkpoints = Checkpoints(self.folder.path / "checkpoints", cfg.checkpoint.keep, identity(matters))
 
     @property
     def status(self) -> dict[str, Any]:
@@ -89,10 +89,12 @@ class Run:
         return self.cfg.resume and status.get("state") == "finished" and status["frames"] >= self.cfg.total_frames
 
     def begin(self, students: Students) -> None:
-        """Load the students' last checkpoint if the run is to be resumed, remove all checkpoints if not."""
+        """Load the students' last checkpoint if the run is to be resumed, remove what an earlier run left if not."""
         self.frames = 0
         if not self.cfg.resume:
             self.checkpoints.clear()
+            for name in ("teacher.json", "trials.json", "policy.safetensors"):  # a trial may not come again
+                (self.folder.path / name).unlink(missing_ok=True)
         elif self.checkpoints.load({"stage": students}, students.parts):
             self.frames = students.frames
             self.evaluations = _rows_until(self.folder.path / "eval.csv", self.frames)

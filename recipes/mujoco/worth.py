@@ -85,7 +85,8 @@ def _decision(cfg: MujocoConfig, results: Sequence[TrialResult]) -> str:
         elif result.winner.endswith(LET_GO):
             said.append(f"{result.winner.removesuffix(LET_GO)} was let go ({sure})")
         elif any(arm.endswith(LET_GO) for arm in result.frames):
-            said.append(f"{result.winner} {'came back' if last.endswith(LET_GO) else 'stayed'} ({sure})")
+            fell = last.endswith(LET_GO)
+            said.append(f"{result.winner} came back (the other fell)" if fell else f"{result.winner} stayed ({sure})")
         else:
             said.append(f"the student went on with {result.winner} ({sure})")
         last = result.winner

@@ -64,10 +64,19 @@ class LeftOut:
 
 
 #: What runs of one label may differ in; and what those without a teacher, and those without a weight, do not read.
-_INCIDENTAL = ["seed", "out", "label", "env.*", "prior.*", "evaluation.*", "checkpoint.*", "resume", "logger"]
-_INCIDENTAL += ["compile", "total_frames"]
+_INCIDENTAL = ["seed", "out", "label", "evaluation.*", "checkpoint.*", "resume", "logger", "compile", "total_frames"]
+_INCIDENTAL += [f"prior.{name}" for name in ("path", "degrade", "feature", "threshold", "prob", "trust_code")]  # named
 _OF_WEIGHTS = ["weight.*", "td_error"]
-_OF_TEACHERS = [*_OF_WEIGHTS, "bonus_coeff", "aux_coeff", "cross_entropy", "schedule.*", "trial.*", "let_go.*"]
+_OF_TEACHERS = [
+    *_OF_WEIGHTS,
+    "prior.*",
+    "bonus_coeff",
+    "aux_coeff",
+    "cross_entropy",
+    "schedule.*",
+    "trial.*",
+    "let_go.*",
+]
 
 
 class _UnusableError(Exception):
@@ -143,11 +152,19 @@ def _read_whole(folder: Path) -> FinishedRun:
         method=method,
         seed=seed,
         label=str(config.get("label") or method),
-        settings=flatten(config),
+        settings=flatten(config) | _digest_of_teacher(folder / "config.json"),
         evaluations=_table(folder / "eval.csv", ["frames", "mean_return"], optional=()),
         metrics=_table(folder / "metrics.csv", needed, optional=("episode*", "aux_coeff", "bonus_coeff"), arm=arm),
         teacher_return=_teacher_return(folder / "teacher.json"),
     )
+
+
+def _digest_of_teacher(file: Path) -> dict[str, str]:
+    """Of its file's content, which may have changed under one path; older runs have none."""
+    try:
+        return {"prior.sha256": str(json.loads(file.read_text())["prior"]["sha256"])}
+    except (ValueError, TypeError, KeyError, OSError):
+        return {}
 
 
 def _teacher_return(file: Path) -> float | None:

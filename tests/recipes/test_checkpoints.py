@@ -122,6 +122,16 @@ def test_one_that_was_published_and_not_sealed_is_not_used(broken_off, capsys):
     assert "which is written last, is not there" in capsys.readouterr().err
 
 
+def test_a_run_that_was_killed_in_its_first_checkpoint_starts_anew(broken_off, stopped, capsys):
+    first, second = sorted(path for path in (broken_off / "checkpoints").iterdir() if path.is_dir())
+    shutil.rmtree(second)
+    for path in (first, second):
+        path.with_name(f"{path.name}.sha256.json").unlink()
+    run(broken_off)
+    assert "starting anew" in capsys.readouterr().err
+    assert (broken_off / "eval.csv").read_bytes() == (stopped / "whole/eval.csv").read_bytes()
+
+
 def test_a_full_disk_is_an_error_that_keeps_the_last_checkpoint(broken_off, monkeypatch):
     usage = shutil.disk_usage(broken_off)
     before = newest(broken_off)

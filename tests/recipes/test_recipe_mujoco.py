@@ -168,6 +168,23 @@ def test_resume_false_starts_anew_and_forgets_the_old_checkpoints(tmp_path, monk
     assert "finished already" not in capsys.readouterr().out
 
 
+def test_resume_false_replaces_what_is_known_of_the_teacher(teacher, tmp_path):
+    options = ("method=e2r", f"prior.path={teacher}", "total_frames=64")
+    run(tmp_path, *options)
+    kept = (tmp_path / "teacher.json").read_bytes()
+    (tmp_path / "teacher.json").write_text(kept.decode().replace("mean_return", "mean_return_of_old"))
+    run(tmp_path, *options, "resume=false")
+    assert (tmp_path / "teacher.json").read_bytes() == kept
+
+
+def test_checkpoints_are_in_the_run_folder_wherever_home_is(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    run(Path("~/run"), "total_frames=64")
+    assert (tmp_path / "home/run/checkpoints").is_dir()
+    assert not (tmp_path / "~").exists()
+
+
 @pytest.mark.parametrize("content", ["[]", "x{"])
 def test_a_damaged_status_is_named_and_kept(content, tmp_path):
     run(tmp_path, "total_frames=64")

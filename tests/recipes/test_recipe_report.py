@@ -88,6 +88,23 @@ def test_runs_that_are_called_alike_but_differ_are_not_averaged(tmp_path: Path) 
     assert "give it a label" in reasons["2"]
 
 
+@pytest.mark.parametrize("what", ["env.minibatch_size", "prior.std", "prior.sha256"])
+def test_runs_with_another_environment_or_teacher_are_not_averaged(what: str, tmp_path: Path) -> None:
+    group, name = what.split(".")
+    for seed, value in enumerate((64, 64, 2048)):
+        settings = {
+            "env": {"id": "Hopper", "version": "v5", "kwargs": {}},
+            "prior": {"path": "teacher.safetensors", "degrade": "none"},
+        }
+        known = {"prior": {"sha256": value}} if name == "sha256" else {}
+        settings[group] |= {} if known else {name: value}
+        folder = write_run(tmp_path / str(seed), method="e2r", seed=seed, config=settings)
+        (folder / "config.json").write_text(json.dumps(known))
+    reasons = left_out_of(tmp_path)
+    assert reasons.keys() == {"2"}
+    assert f"{what}=2048" in reasons["2"]
+
+
 def test_a_run_that_is_older_than_a_setting_is_like_the_others(tmp_path: Path) -> None:
     for seed, settings in enumerate([{}, {"schedule": {"methods": "annealed", "end": 0.5}}]):
         write_run(tmp_path / f"{seed}", method="e2r", seed=seed, config=settings)
