@@ -4,7 +4,7 @@
 
 The tables are all that a report needs, and all that has to be kept: ``<name>.csv`` has every evaluation,
 ``<name>_training.csv`` the means of what training measured, ``<name>_trials.csv`` who won the trials,
-``<name>_teachers.csv`` the return of each teacher. A run that is in
+``<name>_teachers.csv`` the return of each teacher, ``<name>_settings.csv`` what else runs were told. A run that is in
 them is not run again, on whichever machine they are. One that was interrupted goes on from its checkpoint, and one that
 fails or is killed stops no other. Runs whose teacher the study makes wait for it. ``run=false`` says what is missing.
 """
@@ -22,7 +22,7 @@ from recipes.common.run_folder import keep_others_out
 from recipes.common.sweeps import start
 from recipes.mujoco_study.plan import StudyConfig, expand
 from recipes.mujoco_study.tables import Tables
-from recipes.mujoco_study.work import run_missing, summary
+from recipes.mujoco_study.work import check_makers, run_missing, summary
 
 
 def study(cfg: StudyConfig) -> None:
@@ -33,7 +33,8 @@ def study(cfg: StudyConfig) -> None:
     """
     check_keys(cfg)
     runs, tables = expand(cfg), Tables(Path(cfg.out), cfg.name)
-    tables.check_teachers(runs)
+    tables.check(runs)
+    check_makers(runs, tables)
     for line in summary(runs, tables):
         print(line, flush=True)
     if not cfg.run:

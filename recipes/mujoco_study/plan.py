@@ -55,6 +55,11 @@ class StudyRun:
     degraded: bool = False
     makes: Path | None = None
 
+    @property
+    def settings(self) -> str:
+        """What it has in common with the runs of other seeds: its overrides but for seed and folder."""
+        return " ".join(one for one in self.overrides if not one.startswith(("seed=", "out=")))
+
     def __str__(self) -> str:
         """For a line of progress."""
         env, teacher, method, seed = self.key
@@ -107,7 +112,11 @@ def _run(
 ) -> StudyRun:
     advice = {} if teacher == "none" else _teacher(cfg, teacher, env)
     chosen = {"method": label.split()[0]} | dict(cfg.set) | dict(block.get("set") or {}) | advice | dict(settings)
-    overrides = [f"env={env}", f"seed={seed}", *(f"{name}={value}" for name, value in chosen.items())]
+    overrides = [
+        f"env={env}",
+        f"seed={seed}",
+        *(f"{name}={'null' if value is None else value}" for name, value in chosen.items()),
+    ]
     if label != chosen["method"]:
         overrides.append(f"label='{label}'")
     folder = Path(cfg.work) / env / f"{label.replace(' ', '-').replace('=', '')}-{teacher}-{seed}"

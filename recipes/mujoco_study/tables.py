@@ -21,6 +21,8 @@ TRAINING = ("loss_objective", "entropy", "loss_prior", "prior_weight", "prior_cr
 #: What is kept of a trial.
 TRIAL = ("winner", "margin", "confidence", "frames")
 _TEXT = ("env", "teacher", "method", "metric")
+#: How much of the key the rows of a table have that are not of one run.
+_OF_KEY = {"_teachers": 2, "_settings": 3}
 
 
 def read_table(path: Path, needed: Sequence[str]) -> pd.DataFrame:
@@ -54,11 +56,11 @@ class Tables:
     """The tables in their files: read again for each run that is added, and each written whole or not at all."""
 
     def __init__(self, out: Path, name: str) -> None:
-        self.files = {kind: out / f"{name}{kind}.csv" for kind in ("_training", "_trials", "_teachers", "")}
+        self.files = {kind: out / f"{name}{kind}.csv" for kind in ("_training", "_trials", *_OF_KEY, "")}
 
     def rows(self, kind: str) -> pd.DataFrame:
         """The rows of a table; of one that is not there yet, none."""
-        needed = KEY[:2] if kind == "_teachers" else KEY
+        needed = KEY[: _OF_KEY.get(kind, len(KEY))]
         return read_table(self.files[kind], needed) if self.files[kind].exists() else pd.DataFrame(columns=needed)
 
     def finished(self) -> set[tuple]:
@@ -69,9 +71,9 @@ class Tables:
         """Take a finished run in; its last return.
 
         Raises:
-            ValueError: its teacher is not that of the other runs.
+            ValueError: its teacher or its settings are not those of the other runs.
         """
-        self.check_teachers([run])
+        self.check([run])
         evaluations = pd.read_csv(run.folder / "eval.csv", float_precision="round_trip")
         columns = {"frames": "frames", "mean_return": "return", "std_return": "std", "episodes": "episodes"}
         metrics = pd.read_csv(run.folder / "metrics.csv", float_precision="round_trip")
@@ -80,6 +82,7 @@ class Tables:
         kept = [name for name in TRAINING if name in metrics and metrics[name].notna().any()]
         means = {"mean": [metrics[name].mean() for name in kept], "std": [metrics[name].std(ddof=0) for name in kept]}
         new = {
+            "_settings": pd.DataFrame({"settings": [run.settings]}),
             "_training": pd.DataFrame({"metric": kept, **means, "rollouts": len(metrics)}),
             "": evaluations[list(columns)].rename(columns=columns),  # last: it says that the run is there
         }
@@ -93,12 +96,20 @@ class Tables:
             self._put(kind, run.key, table)
         return float(evaluations["mean_return"].iloc[-1])
 
-    def check_teachers(self, runs: Sequence[StudyRun]) -> None:
-        """Refuse to mix runs with different teachers.
+    def check(self, runs: Sequence[StudyRun]) -> None:
+        """Refuse to mix runs with different teachers or settings.
 
         Raises:
-            ValueError: the file of a teacher has another return than the teacher of the finished runs.
+            ValueError: the file of a teacher has another return than the teacher of the finished runs, or they had
+                other settings.
         """
+        settings = {tuple(row[:-1]): row[-1] for row in self.rows("_settings").itertuples(index=False)}
+        for run in runs:
+            if (before := settings.get(run.key[:3], run.settings)) != run.settings:
+                raise ValueError(
+                    f"{run} has the settings {run.settings}, but the runs in {self.files['']} have {before}: give the"
+                    " study another name."
+                )
         known = {(row.env, row.teacher): float(row[-1]) for row in self.rows("_teachers").itertuples(index=False)}
         for run in {run.key[:2]: run for run in runs}.values():
             level, before = _level(run), known.get(run.key[:2])
@@ -110,7 +121,7 @@ class Tables:
 
     def _put(self, kind: str, key: tuple, new: pd.DataFrame) -> None:
         """The rows of a key in the place of those that it has."""
-        names = KEY[:2] if kind == "_teachers" else KEY
+        names = KEY[: _OF_KEY.get(kind, len(KEY))]
         old, key = self.rows(kind), key[: len(names)]
         others = old[[row != key for row in old[names].itertuples(index=False, name=None)]]
         new = new.assign(**dict(zip(names, key, strict=True)))[[*names, *new]]

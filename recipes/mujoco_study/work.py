@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -11,12 +12,37 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from recipes.common.preemption import end_with_parent
 from recipes.common.run_folder import write_file
 from recipes.mujoco_study.plan import ROOT, StudyRun
-from recipes.mujoco_study.tables import Tables, own_return
+from recipes.mujoco_study.tables import KEY, Tables, own_return
 
-__all__ = ["run_missing", "summary"]
+__all__ = ["check_makers", "run_missing", "summary"]
+
+
+def check_makers(runs: Sequence[StudyRun], tables: Tables) -> None:
+    """Refuse to choose from a study's runs and the policy of another one.
+
+    Raises:
+        ValueError: the file that the best of some runs becomes is there, and of none of them.
+    """
+    rows = tables.rows("")
+    last = rows.groupby(KEY, sort=False)["return"].last() if len(rows) else {}
+    for file in dict.fromkeys(run.makes for run in runs if run.makes is not None):
+        makers = [run for run in runs if run.makes == file]
+        kinds = {run.key[:3] for run in makers}
+        returns = [value for key, value in dict(last).items() if key[:3] in kinds]
+        for run in makers:
+            if (run.folder / "eval.csv").exists():  # it may have ended, and not be in the tables yet
+                returns += pd.read_csv(run.folder / "eval.csv")["mean_return"].tolist()[-1:]
+        level = own_return(file) if file.exists() else None
+        if file.exists() and (level is None or not any(math.isclose(level, value, rel_tol=1e-6) for value in returns)):
+            raise ValueError(
+                f"{file} is there, and is the policy of no run of this study, of which the best becomes that file: give"
+                " the study's teacher another path, such as 'teachers.good={prior.path:\"outputs/{env}.safetensors\"}'."
+            )
 
 
 def summary(runs: Sequence[StudyRun], tables: Tables) -> Iterator[str]:

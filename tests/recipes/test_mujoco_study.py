@@ -21,7 +21,7 @@ from sweep_cases import alive, wait_for
 
 from recipes.common.run_folder import write_file
 from recipes.mujoco import train
-from recipes.mujoco_study import tables, work
+from recipes.mujoco_study import __main__, tables, work
 from recipes.mujoco_study.__main__ import study
 from recipes.mujoco_study.plan import StudyRun, expand
 from recipes.mujoco_study.tables import KEY, Tables, own_return
@@ -141,7 +141,7 @@ def test_a_finished_run_is_taken_in_when_its_rows_are_lost_or_were_not_all_writt
         patch.setattr(tables, "write_file", killed)
         with pytest.raises(KeyboardInterrupt):
             study(config(tmp_path, [ONE]))
-    assert [file.name for file in (tmp_path / "tables").glob("*.csv")] == ["tiny_training.csv"]
+    assert {file.name for file in (tmp_path / "tables").glob("*.csv")} == {"tiny_settings.csv", "tiny_training.csv"}
     study(config(tmp_path, [ONE]))
     assert {file: file.read_bytes() for file in whole} == whole
 
@@ -167,6 +167,7 @@ def test_the_best_run_becomes_the_teacher_and_who_needs_it_waits(tmp_path, monke
     better = itertools.count()  # each policy than the last
     with monkeypatch.context() as patch:
         patch.setattr(work, "own_return", lambda _: next(better))
+        patch.setattr(__main__, "check_makers", lambda *_: None)
         study(config(tmp_path, [makers | {"seeds": [2]}, taught], **change))
     assert file.read_bytes() == before  # for it has taught
     worse = f"hopper/none-none-{kept['none'].idxmin()}/policy.safetensors"
@@ -230,6 +231,29 @@ def test_a_second_study_on_the_same_tables_is_refused_while_the_first_is_at_work
     study(cfg)
     study(cfg)
     assert pd.read_csv(tmp_path / "tables/tiny.csv")["seed"].unique().tolist() == [0]
+
+
+@pytest.mark.usefixtures("here")
+def test_runs_with_other_settings_are_not_taken_for_those_of_the_study(tmp_path):
+    study(config(tmp_path, [ONE]))
+    study(config(tmp_path, [ONE | {"seeds": [0, 1]}]))
+    kept = pd.read_csv(tmp_path / "tables/tiny_settings.csv")
+    assert kept[["env", "teacher", "method"]].to_numpy().tolist() == [["hopper", "none", "none"]]
+    with pytest.raises(ValueError, match=r"hopper none none seed 0 has the settings .*ppo\.lr=0\.1.*another name"):
+        study(config(tmp_path, [ONE | {"set": {"ppo.lr": 0.1}}]))
+
+
+@pytest.mark.usefixtures("here")
+def test_the_policy_of_another_study_is_neither_taken_nor_overwritten(tmp_path):
+    makers = ONE | {"makes": "good"}
+    change = {"teachers": {"good": {"prior.path": str(tmp_path / "{env}.safetensors")}}}
+    study(config(tmp_path, [makers], **change))
+    before = (tmp_path / "hopper.safetensors").read_bytes()
+    study(config(tmp_path, [makers], **change))
+    (tmp_path / "work").rename(tmp_path / "gone")
+    with pytest.raises(ValueError, match=r"hopper\.safetensors is there, and is the policy of no run of this study"):
+        study(config(tmp_path, [makers], name="other", **change))
+    assert (tmp_path / "hopper.safetensors").read_bytes() == before
 
 
 STUDY = """
