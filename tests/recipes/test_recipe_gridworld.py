@@ -18,10 +18,7 @@ from composed import with_another_hash_seed
 from omegaconf import OmegaConf
 
 from recipes.gridworld.__main__ import main
-from recipes.gridworld.page import _profile
 from recipes.gridworld.run_parts import runs_of
-from recipes.gridworld.study import open_folder
-from recipes.gridworld.tables import Episodes, prior_weight_table
 from recipes.gridworld.tabular import LOG_FIELDS
 from torchrl_priors.methods import METHODS
 
@@ -129,28 +126,6 @@ def test_tables_say_what_the_episodes_say(small):
         assert weights.loc[("structural_10", "aligned", "visit"), name] == pytest.approx(by_visit, rel=1e-5)
         assert weights.loc[("structural_10", "aligned", "episode"), name] == pytest.approx(by_episode, rel=1e-5)
     assert (weights["gap"] - weights["non_degraded"] + weights["degraded"]).abs().max() < 1e-5
-
-
-def test_intervals_of_the_prior_weight_are_those_of_worlds():
-    cfg = OmegaConf.create(
-        {"methods": ["none", "ae2r"], "priors": ["structural_3"], "bootstrap": {"reps": 500, "seed": 0}}
-    )
-    rng, worlds = np.random.default_rng(0), 50
-    episodes = np.zeros((worlds, 2, 20, len(LOG_FIELDS)))
-    visits = rng.integers(1, 9, (worlds, 20))
-    for group, mean in (("degraded", 0.3), ("other", 0.4)):  # a world's weight is that of all its visits
-        episodes[:, 1, :, LOG_FIELDS.index(f"n_{group}")] = visits
-        episodes[:, 1, :, LOG_FIELDS.index(f"w_{group}")] = visits * rng.normal(mean, 0.1, (worlds, 1))
-    row = prior_weight_table(cfg, Episodes(cfg, episodes)).set_index("average").loc["episode"]
-    for name, error in (("degraded", 0.1), ("non_degraded", 0.1), ("gap", 0.1 * 2**0.5)):
-        half = (row[f"{name}_ci_high"] - row[f"{name}_ci_low"]) / 2
-        assert half == pytest.approx(1.96 * error / worlds**0.5, rel=0.3)
-
-
-def test_performance_profiles_resample_whole_worlds():
-    ratios = np.random.default_rng(0).normal(size=(100, 1)).repeat(7, 1)  # all priors of a world are alike
-    band, alone = (_profile(array, np.zeros(1)) for array in (ratios, ratios[:, :1]))
-    assert (band.high - band.low)[0] == pytest.approx((alone.high - alone.low)[0])
 
 
 def test_figures_are_there_and_the_terminal_names_every_file(small):
@@ -323,18 +298,6 @@ def test_damaged_block_is_named_and_nothing_is_lost(five, tmp_path, capfd):
     block.unlink()
     assert recipe(*FIVE, f"out={copy}") == 0
     assert tables(copy) == tables(five)
-
-
-def test_default_folder_differs_for_each_configuration(tmp_path):
-    plain = {"name": "small", "out": None, "block_worlds": 1, "methods": ["none"], "schedule": {"methods": "annealed"}}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(tmp_path)
-        paths = [
-            open_folder(OmegaConf.create({**plain, "seed": seed, "workers": workers})).path
-            for seed, workers in ((0, 1), (0, 2), (1, 1))
-        ]
-    assert paths[0] == paths[1]
-    assert paths[2] != paths[0]
 
 
 @pytest.mark.usefixtures("without_pictures")

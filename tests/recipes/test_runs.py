@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filelock import FileLock
+from omegaconf import OmegaConf
 from sweep_cases import alive
 
 from recipes.common.run_folder import RunFolder, digest
+from recipes.gridworld.study import open_folder
 
 CONFIG = {"worlds": 3, "student": {"lr": 0.1, "gamma": 0.95}, "methods": ["none", "er"]}
 NUMBERS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([True, False])}
@@ -197,3 +199,15 @@ def test_damaged_arrays_are_named_and_kept(tmp_path, damage):
 def test_arrays_that_were_not_computed_are_missing_not_made_up(tmp_path):
     with pytest.raises((ValueError, OSError), match="blocks/7"):
         RunFolder(tmp_path, CONFIG, "").arrays("blocks/7")
+
+
+def test_default_folder_differs_for_each_configuration(tmp_path):
+    plain = {"name": "small", "out": None, "block_worlds": 1, "methods": ["none"], "schedule": {"methods": "annealed"}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        paths = [
+            open_folder(OmegaConf.create({**plain, "seed": seed, "workers": workers})).path
+            for seed, workers in ((0, 1), (0, 2), (1, 1))
+        ]
+    assert paths[0] == paths[1]
+    assert paths[2] != paths[0]
